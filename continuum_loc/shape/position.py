@@ -1,0 +1,222 @@
+"""Where a module is, from the field it measures: the paper's bounded least squares (eq. 10), compiled.
+
+    min |b - B(p)|^2   subject to   lower <= p <= upper,
+
+p in the magnet's frame (axis x), B the dipole or the ring of `magnet`. B(-p) = B(p), so the bounds keep p on
+the side that the robot is on; there the dipole has one solution only, except on the equatorial plane, where
+the gradient loses a rank. Where starts still end in different optima that fit alike, the one nearest to the
+prior is taken and the module is marked ambiguous.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from continuum_loc.lie import hat
+from continuum_loc.robot import Magnet
+from continuum_loc.shape.magnet import FieldModel, evaluate_field, field_and_gradient, invert_dipole, magnet_parameters
+
+MAX_ITERATIONS = 60
+STEP_TOLERANCE = 1e-11  # m
+SAME_OPTIMUM = 1e-5  # m: closer ends of two starts are one optimum
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionFit:
+    """Positions of M modules in the magnet's frame.
+
+    position: (M, 3) m. residual: (M,) |b - B(p)| in T. bound: (M, 3) int, -1 on the lower bound, 1 on the upper,
+    0 inside. converged: (M,) whether the first-order (KKT) conditions hold: the gradient is zero on every free
+    axis and points out of the box on every bound axis. ambiguous: (M,) another optimum fits as well.
+    """
+
+    position: np.ndarray
+    residual: np.ndarray
+    bound: np.ndarray
+    converged: np.ndarray
+    ambiguous: np.ndarray
+    iterations: np.ndarray
+
+    @property
+    def interior(self) -> np.ndarray:
+        """(M,) whether the optimum lies inside the bounds on every axis."""
+        return ~self.bound.any(axis=-1)
+
+
+class PositionSolver:
+    """Eq. 10 for modules at known arclengths [m] from the magnet.
+
+    The bounds are a box: no module is farther from the magnet than its arclength, and it lies on the magnet's
+    positive side.
+    """
+
+    def __init__(self, magnet: Magnet, arclengths: np.ndarray, model: FieldModel = "ring", slack: float = 1.05) -> None:
+        self.magnet, self.model = magnet, model
+        self.parameters = magnet_parameters(magnet, model)
+        self.arclengths = np.asarray(arclengths, float)
+        reach = slack * self.arclengths[:, None]
+        self.lower = np.concatenate([np.zeros_like(reach), -reach, -reach], axis=1)
+        self.upper = np.concatenate([reach, reach, reach], axis=1)
+
+    def solve(self, field: np.ndarray, start: np.ndarray | None = None) -> PositionFit:
+        """Positions from `field` (M, 3) [T] in the magnet's frame.
+
+        start: (M, 3) prior positions [m], by default the closed-form inverse of the dipole. Raises ValueError
+        for a field that is not finite: a saturated module has no position of its own.
+        """
+        field = np.ascontiguousarray(field, dtype=float)
+        if field.shape != self.lower.shape or not np.isfinite(field).all():
+            raise ValueError(f"expected a finite field of shape {self.lower.shape}, got {field.tolist()}")
+        closed_form = invert_dipole(self.magnet, field)
+        prior = closed_form if start is None else np.asarray(start, float)
+        starts = np.stack([prior, closed_form, -closed_form], axis=1)
+        return PositionFit(*_solve_all(self.parameters, field, starts, self.lower, self.upper))
+
+    def covariance(self, position: np.ndarray, field: np.ndarray, sigma: float, attitude: np.ndarray,
+                   ) -> tuple[np.ndarray, np.ndarray]:
+        """(M, 6, 6) covariance of position and attitude errors in the magnet's frame, and observability (M,).
+
+        sigma: white noise of the field [T]; attitude (M, 3, 3): covariance of the module's rotation error phi in
+        the magnet's frame [rad^2], which turns the measured field: db = -b x phi. The prior that a module lies
+        within its arclength (one sigma of half of it) keeps the result finite where the field says nothing;
+        `observable` is whether the field narrows that prior at least fivefold in every direction.
+        """
+        gradient = field_and_gradient(self.magnet, position, self.model)[1]
+        turn = -hat(field)
+        noise = sigma**2 * np.eye(3) + turn @ attitude @ turn.swapaxes(1, 2)
+        prior_sigma = 0.5 * self.arclengths
+        weighted = np.linalg.solve(noise, gradient).swapaxes(1, 2)  # B'^T noise^-1
+        information = weighted @ gradient + np.eye(3) / prior_sigma[:, None, None]**2
+        P = np.linalg.inv(information)
+        cross = -P @ weighted @ turn @ attitude  # a turned field moves the solution
+        covariance = np.block([[P, cross], [cross.swapaxes(1, 2), attitude]])
+        return covariance, np.sqrt(np.linalg.eigvalsh(P)[:, -1]) < 0.2 * prior_sigma
+
+
+@njit(cache=True)
+def _solve_all(parameters, fields, starts, lower, upper):
+    modules = fields.shape[0]
+    position = np.empty((modules, 3))
+    residual = np.empty(modules)
+    bound = np.zeros((modules, 3), np.int64)
+    converged = np.zeros(modules, np.bool_)
+    ambiguous = np.zeros(modules, np.bool_)
+    iterations = np.zeros(modules, np.int64)
+    for m in range(modules):
+        best = math.inf
+        for k in range(starts.shape[1]):
+            p, cost, count, stationary = _solve_one(parameters, fields[m], starts[m, k], lower[m], upper[m])
+            iterations[m] += count
+            # An alternative replaces the prior's own optimum only by fitting clearly better.
+            apart = math.sqrt(((p - position[m]) ** 2).sum())
+            if k == 0 or cost < 0.25 * best - 1e-16:
+                ambiguous[m] = False
+                position[m] = p
+                best = cost
+                converged[m] = stationary
+            elif apart > SAME_OPTIMUM and cost <= 4.0 * best + 1e-16:
+                ambiguous[m] = True
+            if k == 0 and stationary and cost < 1e-16:
+                break  # an exact fit inside the box, where the field has one source position
+        residual[m] = math.sqrt(best) * math.sqrt((fields[m] ** 2).sum())
+        for i in range(3):
+            if position[m, i] <= lower[m, i]:
+                bound[m, i] = -1
+            elif position[m, i] >= upper[m, i]:
+                bound[m, i] = 1
+    return position, residual, bound, converged, ambiguous, iterations
+
+
+@njit(cache=True)
+def _solve_one(parameters, measured, start, lower, upper):
+    """Levenberg-Marquardt with an active set; the cost is |B(p) - b|^2 / |b|^2."""
+    p = np.minimum(np.maximum(start, lower), upper)
+    size = math.sqrt((measured**2).sum())
+    field, trial_field = np.empty(3), np.empty(3)
+    gradient, trial_gradient = np.empty((3, 3)), np.empty((3, 3))
+    evaluate_field(parameters, p, field, gradient)
+    cost = _relative_cost(field, measured, size)
+    damping = 1e-6
+    stationary = False
+    count = 0
+    while count < MAX_ITERATIONS:
+        count += 1
+        step, reducible = _step(field, gradient, measured, size, p, lower, upper, damping)
+        if reducible < 1e-24:
+            stationary = True
+            break
+        trial = np.minimum(np.maximum(p + step, lower), upper)
+        moved = math.sqrt(((trial - p) ** 2).sum())
+        evaluate_field(parameters, trial, trial_field, trial_gradient)
+        trial_cost = _relative_cost(trial_field, measured, size)
+        if trial_cost <= cost:
+            p = trial
+            cost = trial_cost
+            field[:] = trial_field
+            gradient[:] = trial_gradient
+            damping = max(damping / 10.0, 1e-12)
+            if moved < STEP_TOLERANCE:
+                stationary = True
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e12:
+                stationary = moved < STEP_TOLERANCE
+                break
+    return p, cost, count, stationary
+
+
+@njit(cache=True)
+def _relative_cost(field, measured, size):
+    total = 0.0
+    for i in range(3):
+        total += ((field[i] - measured[i]) / size) ** 2
+    return total
+
+
+@njit(cache=True)
+def _step(field, gradient, measured, size, p, lower, upper, damping):
+    """Damped Gauss-Newton step over the axes that are free to move, and how much cost it could remove."""
+    slope = np.zeros(3)
+    H = np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            slope[i] += gradient[k, i] / size * (field[k] - measured[k]) / size
+            for j in range(3):
+                H[i, j] += gradient[k, i] / size * gradient[k, j] / size
+    largest = max(H[0, 0], H[1, 1], H[2, 2])
+    for i in range(3):
+        held = (p[i] <= lower[i] and slope[i] > 0.0) or (p[i] >= upper[i] and slope[i] < 0.0)
+        if held:
+            H[i, :] = 0.0
+            H[:, i] = 0.0
+            H[i, i] = largest
+            slope[i] = 0.0
+        H[i, i] += damping * (H[i, i] + 1e-9 * largest)
+    step = _solve3(H, -slope)
+    return step, -(slope * step).sum()
+
+
+@njit(cache=True)
+def _solve3(H, b):
+    """Solve the symmetric positive 3x3 system H x = b by Cholesky, in place."""
+    x = b.copy()
+    for i in range(3):
+        for j in range(i + 1):
+            total = H[i, j]
+            for k in range(j):
+                total -= H[i, k] * H[j, k]
+            H[i, j] = math.sqrt(max(total, 1e-300)) if i == j else total / H[j, j]
+    for i in range(3):
+        for k in range(i):
+            x[i] -= H[i, k] * x[k]
+        x[i] /= H[i, i]
+    for i in range(2, -1, -1):
+        for k in range(i + 1, 3):
+            x[i] -= H[k, i] * x[k]
+        x[i] /= H[i, i]
+    return x
