@@ -1,0 +1,40 @@
+# make demo | test | lint | bench | bench-check | install | clean. Everything runs in .venv, which `install` makes.
+.PHONY: install demo test lint bench bench-check clean
+.DELETE_ON_ERROR:
+
+PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
+	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+RUN := $(VENV)/bin
+
+install: $(VENV)/installed
+
+$(VENV)/installed: requirements.txt setup.py setup.cfg pyproject.toml
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or 3.12 is needed, and neither is on PATH." \
+		"Install one, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.12"; exit 1; }
+	@.ci/system-libraries
+	@test -x $(RUN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "$(PYTHON) cannot make environments; on Debian or Ubuntu: apt-get install python3-venv"; exit 1; }
+	$(RUN)/python -m pip install --quiet -r requirements.txt
+	$(RUN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: install
+	$(RUN)/continuum-loc demo
+
+test: install
+	$(RUN)/python -m pytest test
+
+lint: install
+	$(RUN)/ruff check .
+	$(RUN)/python .ci/check_package.py
+
+bench: install
+	$(RUN)/continuum-loc bench
+
+bench-check: install
+	$(RUN)/continuum-loc bench --check
+
+clean:
+	rm -rf $(VENV) build dist install log .pytest_cache .ruff_cache .hypothesis .cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
