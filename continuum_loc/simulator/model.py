@@ -1,0 +1,161 @@
+"""The robot as a MuJoCo model: a rod of rigid links on ball joints, tendons, an insertion drive, contacts.
+
+Nodes at s_0 = 0 ... s_N = L. Body i is rigid and centred on node i; it reaches half a segment to each side,
+and neighbours meet in a joint in the middle of their segment. So node i is the middle of its link, the joint
+spring EI / h is the segment's bending stiffness exactly, and the two half links at the ends are clamped and
+free as they should be: second-order accurate in h.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from continuum_loc.robot import RobotDescription
+from continuum_loc.settings import SettingsError
+from continuum_loc.simulator.plant import PlantSettings, node_arclengths
+
+if TYPE_CHECKING:
+    import mujoco
+
+GRAVITY = 9.81
+ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
+NODE_PREFIX = "node"
+
+
+def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
+               gravity: float = GRAVITY) -> mujoco.MjSpec:
+    """The model before compilation. `scene` gives the convex pieces to collide with, None the empty space."""
+    import mujoco
+
+    chosen = plant.profile(profile)
+    spec = mujoco.MjSpec()
+    spec.modelname = robot.name
+    spec.option.timestep = chosen.time_step
+    spec.option.gravity = (0.0, 0.0, -gravity)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    spec.option.solver = mujoco.mjtSolver.mjSOL_CG
+    spec.compiler.autolimits = True
+    nodes = node_arclengths(robot, plant, chosen.link_length)
+    _check_step(plant, nodes, chosen.time_step)
+    _add_rod(spec, robot, plant, nodes)
+    _add_tendons(spec, plant, nodes)
+    if scene is not None:
+        _add_scene(spec, robot, plant, scene)
+    return spec
+
+
+def build_model(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
+                gravity: float = GRAVITY) -> mujoco.MjModel:
+    """Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip."""
+    return build_spec(robot, plant, scene, profile, gravity).compile()
+
+
+def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> None:
+    """Joint springs are implicit; what stays explicit is the insertion drive, stable to omega * step < 2."""
+    omega = np.sqrt(plant.carriage_stiffness / plant.carriage_mass)
+    if omega * time_step > 1.0:
+        raise SettingsError(f"time_step {time_step} s is too long for the insertion drive "
+                            f"({omega:.0f} rad/s): use at most {1.0 / omega:.4f} s, or soften carriage_stiffness")
+
+
+def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndarray) -> None:
+    parent, joint_frame = _add_base(spec, robot, plant)
+    half = np.concatenate([[0.0], np.diff(nodes) / 2.0, [0.0]])  # half[i], half[i + 1]: reach of node i back, forth
+    for i in range(len(nodes)):
+        body = parent.add_body(name=f"{NODE_PREFIX}{i}", pos=joint_frame)
+        if i > 0:
+            _add_joints(body, i, plant, 2.0 * half[i])
+        _add_link(body, robot, plant, half[i], half[i + 1])
+        parent, joint_frame = body, (half[i + 1] + (half[i + 1] if i + 1 < len(nodes) else 0.0), 0.0, 0.0)
+
+
+def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
+    """The body that the rod's first node is fixed to, on its insertion slide where the base can travel."""
+    import mujoco
+
+    quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
+    carriage = spec.worldbody.add_body(name="carriage", pos=robot.base.xyz, quat=quat)
+    if robot.base.insertion.mode != "fixed":
+        carriage.add_joint(name="insertion", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0),
+                           armature=plant.carriage_mass)
+        drive = spec.add_actuator(name="insertion", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="insertion")
+        drive.set_to_position(kp=plant.carriage_stiffness, kv=carriage_damping(plant))
+    return carriage, (0.0, 0.0, 0.0)
+
+
+def carriage_damping(plant: PlantSettings) -> float:
+    """Velocity gain [N s/m] that damps the insertion drive critically."""
+    return 2.0 * np.sqrt(plant.carriage_stiffness * plant.carriage_mass)
+
+
+def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
+    """The spring between nodes i - 1 and i, in the middle of their segment: EI / h, and EA / h where it stretches."""
+    import mujoco
+
+    pos = (-segment / 2.0, 0.0, 0.0)
+    if plant.EA is not None:
+        body.add_joint(name=f"stretch{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0), pos=pos,
+                       stiffness=[plant.EA / segment, 0, 0], damping=[plant.relaxation * plant.EA / segment, 0, 0])
+    body.add_joint(name=f"bend{i}", type=mujoco.mjtJoint.mjJNT_BALL, pos=pos,
+                   stiffness=[plant.EI / segment, 0, 0], damping=[plant.relaxation * plant.EI / segment, 0, 0])
+
+
+def _add_link(body, robot: RobotDescription, plant: PlantSettings, back: float, forth: float) -> None:
+    """Inertia of a solid cylinder from -back to +forth of the node, and the capsule that touches the scene."""
+    import mujoco
+
+    length, centre = back + forth, (forth - back) / 2.0
+    mass = plant.mass_per_metre * length
+    axial = mass * robot.radius**2 / 2.0
+    across = mass * (robot.radius**2 / 4.0 + length**2 / 12.0)
+    body.mass, body.ipos, body.inertia = mass, (centre, 0.0, 0.0), (axial, across, across)
+    body.explicitinertial = True
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(-back, 0, 0, forth, 0, 0), size=(robot.radius, 0, 0),
+                  mass=0.0, friction=(plant.contact_friction, 0.005, 0.0001), contype=ROBOT_BIT, conaffinity=SCENE_BIT,
+                  rgba=(0.9, 0.6, 0.2, 1.0))
+
+
+def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
+    """Each tendon threads a site on every link up to its module's end; its actuator pulls with ctrl newtons."""
+    import mujoco
+
+    names = iter(plant.tendon_names)
+    for group in plant.tendons:
+        last = int(np.argmin(np.abs(nodes - group.end)))
+        for azimuth in np.radians(group.azimuth_deg):
+            name = next(names)
+            offset = (0.0, group.radius * np.cos(azimuth), group.radius * np.sin(azimuth))
+            tendon = spec.add_tendon(name=name, frictionloss=group.friction)
+            for i in range(last + 1):
+                spec.body(f"{NODE_PREFIX}{i}").add_site(name=f"{name}_{i}", pos=offset, group=4)
+                tendon.wrap_site(f"{name}_{i}")
+            pull = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_TENDON, target=name,
+                                     ctrllimited=True, ctrlrange=(0.0, group.max_force))
+            pull.set_to_motor()
+            pull.gear = (-1.0, 0, 0, 0, 0, 0)
+
+
+def _add_scene(spec, robot: RobotDescription, plant: PlantSettings, scene) -> None:
+    """Convex pieces that the robot can reach, as fixed geoms."""
+    import mujoco
+
+    for i, vertices in enumerate(scene.hulls):
+        if not _reachable(robot, vertices):
+            continue
+        spec.add_mesh(name=f"hull{i}", uservert=vertices.ravel())
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull{i}", group=3, mass=0.0,
+                                friction=(plant.contact_friction, 0.005, 0.0001),
+                                contype=SCENE_BIT, conaffinity=ROBOT_BIT, rgba=(0.3, 0.7, 0.3, 1.0))
+
+
+def _reachable(robot: RobotDescription, vertices: np.ndarray) -> bool:
+    """Whether a piece's bounding box meets the capsule-shaped reach of the rod over its whole insertion."""
+    T = robot.base.T_map_base
+    travel = np.linspace(*robot.base.insertion.range, 8)
+    origins = T[:3, 3] + travel[:, None] * T[:3, 0]
+    nearest = np.clip(origins, vertices.min(axis=0), vertices.max(axis=0))
+    distance = np.linalg.norm(nearest - origins, axis=1).min()
+    return bool(distance < robot.length + 2.0 * robot.radius)

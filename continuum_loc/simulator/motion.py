@@ -1,0 +1,108 @@
+"""The rod's continuous motion, from the states at the time steps.
+
+Poses at the steps are exact. Between them each frame follows the cubic Hermite curve in the local variable on
+SE(3), whose velocities at the steps are the mean of the two neighbouring steps' twists; so velocity is the
+derivative of pose, everywhere, and every sensor can be sampled at its own instant.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from continuum_loc import lie
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """The robot at the end of one time step.
+
+    time: seconds since the trajectory's start. T_map_node: (N + 1, 4, 4). insertion: m.
+    tendon_length: (K,) m; tension: (K,) N.
+    """
+
+    time: float
+    T_map_node: np.ndarray
+    insertion: float
+    tendon_length: np.ndarray
+    tension: np.ndarray
+
+
+class Motion:
+    """Four consecutive states; motion is defined between the middle two."""
+
+    def __init__(self) -> None:
+        self._states: deque[State] = deque(maxlen=4)
+
+    def append(self, state: State) -> None:
+        """The next state, one time step after the last."""
+        self._states.append(state)
+
+    def covers(self, time: float) -> bool:
+        """Whether `time` lies between the middle two states."""
+        return len(self._states) == 4 and time < self._states[2].time - 1e-9
+
+    def _at(self, time: float) -> tuple[float, float]:
+        """Fraction of the middle interval, and its duration [s]."""
+        start, end = self._states[1].time, self._states[2].time
+        if not start - 1e-9 <= time <= end + 1e-9:
+            raise ValueError(f"time {time} s lies outside the stored interval [{start}, {end}] s")
+        fraction = (time - start) / (end - start)
+        return (0.0 if abs(fraction) < 1e-6 else fraction), end - start
+
+    def frames(self, nodes: np.ndarray, T_node_frame: np.ndarray) -> np.ndarray:
+        """(4, F, 4, 4) poses of frames fixed to nodes, at the four states."""
+        return np.stack([state.T_map_node[nodes] for state in self._states]) @ T_node_frame
+
+    def pose(self, time: float, nodes: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """(F, 4, 4) poses T_map_node of the chosen nodes."""
+        if self._at(time)[0] == 0.0:
+            return self._states[1].T_map_node[nodes].copy()
+        return self.kinematics(time, self.frames(nodes, np.eye(4)))[0]
+
+    def kinematics(self, time: float, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pose T_map_frame (F, 4, 4), body twist (F, 6) [v; w] and acceleration of the origin (F, 3) in map.
+
+        `frames` are the four states of `frames()`. The acceleration is the second difference of position,
+        linear between the steps.
+        """
+        u, d = self._at(time)
+        twist = lie.log(lie.inverse(frames[:-1]) @ frames[1:]) / d
+        v_a, v_b = (twist[0] + twist[1]) / 2.0, (twist[1] + twist[2]) / 2.0
+        position = frames[..., :3, 3]
+        acceleration = np.diff(position, n=2, axis=0) / d**2
+        acceleration = (1.0 - u) * acceleration[0] + u * acceleration[1]
+        if u == 0.0:
+            return frames[1].copy(), v_a, acceleration
+        xi = d * twist[1]
+        w_b = np.einsum("fij,fj->fi", lie.right_jacobian_inverse(xi), v_b)
+        gamma = u**2 * (3.0 - 2.0 * u) * xi + u * (1.0 - u)**2 * d * v_a - u**2 * (1.0 - u) * d * w_b
+        rate = 6.0 * u * (1.0 - u) * twist[1] + (1.0 - u) * (1.0 - 3.0 * u) * v_a + u * (3.0 * u - 2.0) * w_b
+        return frames[1] @ lie.exp(gamma), np.einsum("fij,fj->fi", lie.right_jacobian(gamma), rate), acceleration
+
+    def encoders(self, time: float) -> tuple[float, np.ndarray, np.ndarray]:
+        """Insertion [m], tendon lengths (K,) [m] and tensions (K,) [N], linear between the steps."""
+        u, _ = self._at(time)
+        a, b = self._states[1], self._states[2]
+        return tuple((1.0 - u) * x + u * y for x, y in (
+            (a.insertion, b.insertion), (a.tendon_length, b.tendon_length), (a.tension, b.tension)))
+
+
+def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
+    """(N, 6) strain [nu; omega] of each segment: the screw that takes one node to the next, per unit of s.
+
+    For pure bending this is the constant-curvature arc that is tangent to both links at their middles.
+    """
+    return lie.log(lie.inverse(T_map_node[:-1]) @ T_map_node[1:]) / np.diff(nodes_s)[:, None]
+
+
+def backbone(T_map_node: np.ndarray, nodes_s: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) poses T_map_backbone(s) along the arcs through the nodes; s (...) in [0, L]."""
+    s = np.asarray(s, float)
+    if np.any(s < nodes_s[0] - 1e-9) or np.any(s > nodes_s[-1] + 1e-9):
+        raise ValueError(f"arclength must lie in [{nodes_s[0]}, {nodes_s[-1]}] m, got {s.min()} to {s.max()}")
+    segment = np.clip(np.searchsorted(nodes_s, s, side="right") - 1, 0, len(nodes_s) - 2)
+    xi = segment_strain(T_map_node, nodes_s)[segment] * (s - nodes_s[segment])[..., None]
+    return T_map_node[segment] @ lie.exp(xi)

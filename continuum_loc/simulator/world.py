@@ -1,0 +1,295 @@
+"""The simulated world: a robot in a scene, driven along a trajectory, and every sensor's samples with the truth.
+
+    world = World(load_robot("engine"), load_scene("S0"), "t1")
+    for sample in world.run(20.0):
+        ...
+
+Samples come in the order of their stamps. The same seed gives the same samples, bit for bit.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from continuum_loc.measurements import NANOSECONDS, Measurement, TruthSample
+from continuum_loc.robot import RobotDescription, Sensor
+from continuum_loc.settings import SettingsError
+from continuum_loc.simulator import sensors as models
+from continuum_loc.simulator.model import GRAVITY, NODE_PREFIX, build_model, carriage_damping
+from continuum_loc.simulator.motion import Motion, State, backbone, segment_strain
+from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclengths
+from continuum_loc.simulator.trajectories import Trajectory, trajectory
+
+if TYPE_CHECKING:
+    from continuum_loc.simulator.scenes import Scene
+
+TRUTH_RATE = 100.0
+ENCODER_RATE = 50.0
+ENCODER_SIGMA = 1e-4  # m, tendon displacement
+DEFAULT_START = NANOSECONDS
+REST_SPEED = 1e-4  # m/s: slower than this everywhere counts as settled
+SETTLE_LIMIT = 60.0  # s of simulated time
+SETTLE_DAMPING = 8.0  # damping while settling, relative to the plant's: near critical for the first mode
+
+
+class SimulationDiverged(RuntimeError):
+    """The simulation cannot go on; the message says when, where and what to change."""
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """One kind of sensor: its rate [Hz] and how to sample it at (stamp, seconds)."""
+
+    rate: float
+    sample: Callable[[int, float], list[Any]]
+
+
+class World:
+    """A robot, a scene and a trajectory; `run` simulates them from rest.
+
+    plant: PlantSettings, a name or a YAML file; None takes the bundled plant of the robot's name.
+    trajectory: a name of `trajectories.trajectory`, or a Trajectory.
+    scene: None is empty space, without ToF frames.
+    faults: wrappers of `faults`, applied to the stream in order.
+    """
+
+    def __init__(self, robot: RobotDescription, scene: Scene | None, trajectory: str | Trajectory, *,
+                 plant: PlantSettings | str | Path | None = None, profile: str = "live", tof_fidelity: str = "paper",
+                 seed: int = 0, faults: tuple = (), start_stamp: int = DEFAULT_START) -> None:
+        self.robot, self.scene, self.seed, self.faults, self.start_stamp = robot, scene, seed, faults, start_stamp
+        self.plant = plant if isinstance(plant, PlantSettings) else load_plant(plant or robot.name)
+        self.trajectory = _resolve(trajectory, robot, self.plant)
+        self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
+        self.tof_fidelity = tof_fidelity
+        self.body = _Body(robot, self.plant, build_model(robot, self.plant, scene, profile), self.trajectory)
+        self.motion = Motion()
+
+    def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
+        """Samples of the first `duration` seconds (default: the trajectory's), in the order of their stamps.
+
+        Every call starts again from rest. Raises SimulationDiverged.
+        """
+        stream = self._run(self.trajectory.duration if duration is None else duration)
+        for fault in self.faults:
+            stream = fault(stream)
+        return stream
+
+    def full_state(self, s: np.ndarray) -> np.ndarray:
+        """(..., 4, 4) true T_map_backbone at arclengths s (...), at the sample yielded last."""
+        return backbone(self.motion.pose(self._now), self.nodes_s, s)
+
+    def _run(self, duration: float) -> Iterator[Measurement | TruthSample]:
+        self.body.settle()
+        self.motion = Motion()
+        for state in self.body.resting_states():
+            self.motion.append(state)
+        streams = self._streams()
+        for stamp, _, stream in heapq.merge(*(_instants(i, s.rate, duration) for i, s in enumerate(streams))):
+            self._now = stamp / NANOSECONDS
+            while not self.motion.covers(self._now):
+                self.motion.append(self.body.step())
+            yield from streams[stream].sample(self.start_stamp + stamp, self._now)
+
+    def _streams(self) -> list[_Stream]:
+        """Sensors in a fixed order, each with its own random stream."""
+        robot, generators = self.robot, _generators(self.seed)
+        streams = [_Stream(TRUTH_RATE, self._truth), self._encoder_stream(next(generators))]
+        for present, make in ((robot.imu, self._imu_stream), (robot.strain, self._strain_stream),
+                              (robot.hall, self._hall_stream), (robot.trackers, self._tracker_stream),
+                              (robot.tof and self.scene, self._tof_stream)):
+            rng = next(generators)
+            if present:
+                streams.append(make(rng))
+        return streams
+
+    def _truth(self, stamp: int, time: float) -> list[TruthSample]:
+        rings = np.searchsorted(self.nodes_s, self.robot.ring_arclengths - 1e-6)
+        return [TruthSample(stamp, self.motion.pose(time, np.concatenate([[0], rings])))]
+
+    def _encoder_stream(self, rng: np.random.Generator) -> _Stream:
+        moves = self.robot.base.insertion.mode == "measured"
+        model = models.Encoders(self.plant.tendon_names, self.body.straight_length, ENCODER_SIGMA,
+                                self.robot.base.insertion.sigma if moves else None, rng)
+        return _Stream(ENCODER_RATE, lambda stamp, time: [model.measure(stamp, *self.motion.encoders(time))])
+
+    def _imu_stream(self, rng: np.random.Generator) -> _Stream:
+        model = models.ImuSensors(self.robot.imu_model, self.robot.imu, GRAVITY, rng)
+        nodes, mounts = self._mounts(self.robot.imu)
+
+        def sample(stamp: int, time: float) -> list:
+            return model.measure(stamp, *self.motion.kinematics(time, self.motion.frames(nodes, mounts)))
+
+        return _Stream(self.robot.imu_model.rate, sample)
+
+    def _strain_stream(self, rng: np.random.Generator) -> _Stream:
+        model = models.StrainSensor(self.robot.strain, self.robot.strain_stations, self.nodes_s, rng)
+
+        def sample(stamp: int, time: float) -> list:
+            return [model.measure(stamp, segment_strain(self.motion.pose(time), self.nodes_s))]
+
+        return _Stream(self.robot.strain.rate, sample)
+
+    def _hall_stream(self, rng: np.random.Generator) -> _Stream:
+        magnet = self.robot.magnet
+        model = models.HallSensors(self.robot.hall_model, self.robot.hall, magnet, self.plant.earth_field, rng)
+        pose = self._posed(self.robot.hall)
+
+        def sample(stamp: int, time: float) -> list:
+            nodes = self.motion.pose(time)
+            T_map_magnet = backbone(nodes, self.nodes_s, magnet.s) if magnet else nodes[0]
+            return model.measure(stamp, pose(time), T_map_magnet)
+
+        return _Stream(self.robot.hall_model.rate, sample)
+
+    def _tracker_stream(self, rng: np.random.Generator) -> _Stream:
+        model = models.Trackers(self.robot.trackers, rng)
+        pose = self._posed(self.robot.trackers)
+        return _Stream(model.model.rate, lambda stamp, time: model.measure(stamp, pose(time)))
+
+    def _tof_stream(self, rng: np.random.Generator) -> _Stream:
+        from continuum_loc.simulator.raycast import RayCaster
+        from continuum_loc.simulator.tof import TofSensorModel
+
+        model = TofSensorModel(self.robot.tof_model, RayCaster(self.scene), self.tof_fidelity, rng)
+        names = [sensor.name for sensor in self.robot.tof]
+        pose = self._posed(self.robot.tof)
+
+        def sample(stamp: int, time: float) -> list:
+            return model.measure(pose(time), names, stamp, body_capsules=self._capsules(time))
+
+        return _Stream(self.robot.tof_model.rate, sample)
+
+    def _capsules(self, time: float) -> np.ndarray:
+        """(M, 7) ends and radius of the body's pieces, as `raycast.cast_capsules` takes them."""
+        points = self.motion.pose(time)[:, :3, 3]
+        return np.column_stack([points[:-1], points[1:], np.full(len(points) - 1, self.robot.radius)])
+
+    def _posed(self, sensors: tuple[Sensor, ...]) -> Callable[[float], np.ndarray]:
+        """time [s] -> (F, 4, 4) true poses T_map_sensor."""
+        nodes, mounts = self._mounts(sensors)
+        return lambda time: self.motion.pose(time, nodes) @ mounts
+
+    def _mounts(self, sensors: tuple[Sensor, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Node of each sensor's ring (F,), and T_ring_sensor (F, 4, 4)."""
+        s = np.array([self.robot.sensor_arclength(sensor.name) for sensor in sensors])
+        mounts = np.stack([sensor.mount.T_ring_sensor for sensor in sensors])
+        return np.searchsorted(self.nodes_s, s - 1e-6), mounts
+
+
+class _Body:
+    """MuJoCo's side: drives in, states out."""
+
+    def __init__(self, robot: RobotDescription, plant: PlantSettings, model: Any, path: Trajectory) -> None:
+        import mujoco
+
+        self._mujoco, self.model, self.data, self.path = mujoco, model, mujoco.MjData(model), path
+        self._nodes = np.array([i for i in range(model.nbody) if model.body(i).name.startswith(NODE_PREFIX)])
+        self._slides = robot.base.insertion.mode != "fixed"
+        self._lead = carriage_damping(plant) / plant.carriage_stiffness  # s: cancels the drag of the drive's damping
+        self._damping = model.dof_damping.copy()
+        mujoco.mj_forward(model, self.data)
+        self.straight_length = self.data.ten_length.copy()
+        self._pending_step = 0
+
+    def settle(self) -> None:
+        """Bring the robot to rest under the first command, from straight; time 0 is then the trajectory's start."""
+        mujoco, model, data = self._mujoco, self.model, self.data
+        mujoco.mj_resetData(model, data)
+        self._command(0.0)
+        if self._slides:
+            data.qpos[0] = data.ctrl[0]
+        model.dof_damping[:] = SETTLE_DAMPING * self._damping
+        quiet = 0
+        while quiet < 20:
+            if data.time > SETTLE_LIMIT:
+                raise SimulationDiverged(f"the robot did not come to rest within {SETTLE_LIMIT} s under the "
+                                         "trajectory's first tensions: raise `relaxation` in the plant, or begin "
+                                         "the trajectory without contact")
+            self._advance()
+            quiet = quiet + 1 if self._speed() < REST_SPEED else 0
+        model.dof_damping[:] = self._damping
+        data.time, data.qvel[:] = 0.0, 0.0
+        self._steps = 0
+
+    def resting_states(self) -> list[State]:
+        """The states at -1, 0 and +1 steps: motion is defined from time 0 on."""
+        first = self.step()
+        before = State(-self.model.opt.timestep, first.T_map_node, first.insertion, first.tendon_length, first.tension)
+        return [before, first, self.step()]
+
+    def step(self) -> State:
+        """The state at the next step's beginning; then the drives' new command acts and the step is taken.
+
+        MuJoCo's derived quantities after a step still belong to its beginning, so no extra kinematics are needed.
+        """
+        time = self._steps * self.model.opt.timestep
+        self._command(time)
+        self._advance()
+        self._steps += 1
+        return self._state(time)
+
+    def _command(self, time: float) -> None:
+        command = self.path.command(time)
+        drive = [command.insertion + self._lead * command.insertion_rate] if self._slides else []
+        self.data.ctrl[:] = np.append(drive, command.tension)
+
+    def _advance(self) -> None:
+        self._mujoco.mj_step(self.model, self.data)
+        if not np.all(np.isfinite(self.data.qacc)) or np.abs(self.data.qvel).max(initial=0.0) > 1e3:
+            raise SimulationDiverged(self._diagnosis())
+
+    def _diagnosis(self) -> str:
+        worst = int(np.argmax(np.nan_to_num(np.abs(self.data.qvel), nan=np.inf)))
+        joint = self.model.joint(int(self.model.dof_jntid[worst])).name
+        return (f"the simulation diverged at {self.data.time:.4f} s in joint '{joint}': shorten `time_step` (now "
+                f"{self.model.opt.timestep} s) or raise `relaxation` in the plant, or lower the tensions there")
+
+    def _speed(self) -> float:
+        """Fastest node [m/s] (and rotation [rad/s], which for a rod of about a metre is as telling)."""
+        return float(np.abs(self.data.cvel[self._nodes]).max())
+
+    def _state(self, time: float) -> State:
+        data = self.data
+        T = np.zeros((len(self._nodes), 4, 4))
+        T[:, :3, :3] = data.xmat[self._nodes].reshape(-1, 3, 3)
+        T[:, :3, 3] = data.xpos[self._nodes]
+        T[:, 3, 3] = 1.0
+        tendons = data.ctrl[1:] if self._slides else data.ctrl
+        return State(time, T, self._insertion(T), data.ten_length.copy(), tendons.copy())
+
+    def _insertion(self, T_map_node: np.ndarray) -> float:
+        """Travel of the base along its own axis [m], from the same kinematics as the poses."""
+        base = self.model.body("carriage")
+        R = np.zeros(9)
+        self._mujoco.mju_quat2Mat(R, base.quat)
+        return float((T_map_node[0, :3, 3] - base.pos) @ R.reshape(3, 3)[:, 0])
+
+
+def _resolve(path: str | Trajectory, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+    path = trajectory(path, robot, plant) if isinstance(path, str) else path
+    tendons = len(plant.tendon_names)
+    if path.tensions.shape[1] != tendons:
+        raise SettingsError(f"trajectory '{path.name}' drives {path.tensions.shape[1]} tendons, "
+                            f"the plant has {tendons}")
+    least, most = robot.base.insertion.range
+    if path.insertion.min() < least - 1e-9 or path.insertion.max() > most + 1e-9:
+        raise SettingsError(f"trajectory '{path.name}' inserts {path.insertion.min()} to {path.insertion.max()} m; "
+                            f"robot '{robot.name}' can travel {least} to {most} m")
+    return path
+
+
+def _generators(seed: int) -> Iterator[np.random.Generator]:
+    """One independent random stream after another."""
+    return (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(16))
+
+
+def _instants(stream: int, rate: float, duration: float) -> Iterator[tuple[int, int, int]]:
+    """(stamp from the start [ns], priority, stream) at k / rate, while before `duration`."""
+    count = int(np.ceil(duration * rate - 1e-9))
+    return ((round(k * NANOSECONDS / rate), stream, stream) for k in range(count))
