@@ -1,0 +1,146 @@
+"""Least squares on a chain of columns: block-tridiagonal elimination, marginalisation and covariances.
+
+Interval k couples columns k and k + 1 by a quadratic  1/2 [x_k; x_k+1]^T H [x_k; x_k+1] + g^T [x_k; x_k+1]  in the
+columns' offsets x from their linearisation points. Eliminating columns from the oldest to the newest leaves on each
+a *message* (Lambda, eta), all that the past says of it:
+
+    S_k = Lambda_k + H_aa,   Lambda_k+1 = H_bb - H_ab^T S_k^-1 H_ab,   eta_k+1 = g_b - H_ab^T S_k^-1 (eta_k + g_a).
+
+Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the message it left.
+Messages before the first interval that changed are kept from the last solve. Covariances come by the recursion
+P_k = S_k^-1 + G_k P_k+1 G_k^T, G_k = S_k^-1 H_ab; no matrix is inverted but the newest one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+
+class SingularError(ArithmeticError):
+    """An elimination met a matrix that is not positive definite; `column` says at which one."""
+
+    def __init__(self, column: int):
+        super().__init__(f"the information of column {column} is not positive definite: some of its directions are "
+                         "not observed by any measurement or prior")
+        self.column = column
+
+
+@dataclass(slots=True, eq=False)
+class Blocks:
+    """Normal equations of one interval: H (2 D, 2 D) symmetric, g (2 D,), and the robust cost at the linearisation point."""
+
+    H: np.ndarray
+    g: np.ndarray
+    cost: float = 0.0
+
+    @classmethod
+    def zeros(cls, dim: int) -> Blocks:
+        return cls(np.zeros((2 * dim, 2 * dim)), np.zeros(2 * dim))
+
+    def clear(self) -> None:
+        self.H.fill(0.0)
+        self.g.fill(0.0)
+        self.cost = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Message:
+    """What the past says of a column: information (D, D) and gradient (D,) at its linearisation point."""
+
+    information: np.ndarray
+    gradient: np.ndarray
+
+
+@dataclass(slots=True, eq=False)
+class _Elimination:
+    """One eliminated column: L (lower Cholesky factor of S), Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
+
+    L: np.ndarray
+    Y: np.ndarray
+    y: np.ndarray
+
+
+class Chain:
+    """The elimination of a window's intervals, with what can be kept from one solve to the next."""
+
+    def __init__(self, dim: int, start: Message):
+        self.dim = dim
+        self.messages = [start]
+        self._eliminated: list[_Elimination] = []
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+
+    def solve(self, intervals: list[Blocks], first_changed: int, damping: float = 0.0) -> list[np.ndarray]:
+        """Offsets (D,) of all columns. Raises SingularError."""
+        self._forward(intervals, first_changed, damping)
+        L, y = self._last
+        offsets = [-_solve_upper(L, y)]
+        for step in reversed(self._eliminated):
+            offsets.append(-_solve_upper(step.L, step.y + step.Y @ offsets[-1]))
+        return offsets[::-1]
+
+    def covariances(self, count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Marginal covariances (D, D) of the newest `count` columns, oldest of them first, and the `count - 1`
+        cross covariances of each with the next."""
+        marginals, crosses = [_inverse(self._last[0])], []
+        for step in reversed(self._eliminated[len(self._eliminated) - (count - 1):] if count > 1 else []):
+            G = blas.dtrsm(1.0, step.L, step.Y, lower=1, trans_a=1)
+            GP = G @ marginals[-1]
+            crosses.append(-GP)
+            marginals.append(_inverse(step.L) + GP @ G.T)
+        return marginals[::-1], crosses[::-1]
+
+    def forget_oldest(self) -> None:
+        """Marginalise the oldest column: its message to the next becomes the start."""
+        if not self._eliminated:
+            raise SingularError(0)
+        del self.messages[0], self._eliminated[0]
+
+    def _forward(self, intervals: list[Blocks], first: int, damping: float) -> None:
+        D = self.dim
+        first = min(first, len(self._eliminated))
+        del self.messages[first + 1:], self._eliminated[first:]
+        for k in range(first, len(intervals)):
+            H, g, message = intervals[k].H, intervals[k].g, self.messages[k]
+            L = _cholesky(message.information + H[:D, :D], damping, k)
+            Y = blas.dtrsm(1.0, L, H[:D, D:], lower=1)
+            y = _solve_lower(L, message.gradient + g[:D])
+            information = np.asfortranarray(H[D:, D:])
+            information = blas.dsyrk(-1.0, Y, beta=1.0, c=information, trans=1, lower=1)
+            self._eliminated.append(_Elimination(L, Y, y))
+            self.messages.append(Message(_symmetrised(information), g[D:] - Y.T @ y))
+        newest = self.messages[-1]
+        L = _cholesky(newest.information, damping, len(intervals))
+        self._last = (L, _solve_lower(L, newest.gradient))
+
+
+def _cholesky(S: np.ndarray, damping: float, column: int) -> np.ndarray:
+    if damping > 0.0:
+        S = S + damping * np.diag(np.diag(S))
+    L, info = lapack.dpotrf(S, lower=1, clean=1)
+    if info != 0 or not np.isfinite(L[-1, -1]):
+        raise SingularError(column)
+    return L
+
+
+def _symmetrised(lower: np.ndarray) -> np.ndarray:
+    """The full matrix of one whose lower triangle alone was updated."""
+    out = np.tril(lower)
+    out += np.tril(lower, -1).T
+    return out
+
+
+def _solve_lower(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return blas.dtrsv(L, b, lower=1)
+
+
+def _solve_upper(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return blas.dtrsv(L, b, lower=1, trans=1)
+
+
+def _inverse(L: np.ndarray) -> np.ndarray:
+    """(L L^T)^-1, full."""
+    inverse, _ = lapack.dpotri(L, lower=1)
+    return _symmetrised(inverse)

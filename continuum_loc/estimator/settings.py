@@ -1,0 +1,132 @@
+"""Every number of the filter that can be tuned, with its unit; `continuum-loc tune` writes such a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+
+from continuum_loc.robot import Vector6
+from continuum_loc.settings import Settings, SettingsError, load_settings
+
+PRESETS_FOLDER = Path(__file__).parent / "presets"
+
+
+class PriorSettings(Settings):
+    """Process noise: power spectral densities per component [translation; rotation] of body-frame rates."""
+
+    velocity: Vector6 = Field((0.1, 0.1, 0.1, 3.0, 3.0, 3.0),
+                              description="white noise on acceleration, in time [m^2/s^3, rad^2/s^3]")
+    strain_rate: Vector6 = Field((1e-4, 1e-4, 1e-4, 1e-2, 4.0, 4.0),
+                                 description="random walk of the strain, in time [1/s, 1/(m^2 s)]")
+    strain: Vector6 = Field((1e-5, 1e-5, 1e-5, 1e-3, 15.0, 15.0),
+                            description="white noise on the strain's slope, in arclength [1/m, 1/m^3]")
+    velocity_slope: Vector6 = Field((0.01, 0.01, 0.01, 1.0, 1.0, 1.0),
+                                    description="random walk of the velocity, in arclength [m/s^2, rad^2/(s^2 m)]")
+    initial_velocity_sigma: tuple[float, float] = Field(
+        (0.05, 0.1), description="spread of the velocity at the first instant [m/s, rad/s]")
+    memory: float = Field(1.0, gt=0.0, description="time over which the rest strain and the base pose count as one "
+                                                   "independent observation [s]")
+
+
+class TofSettings(Settings):
+    """Point-to-plane factors."""
+
+    enabled: bool = True
+    floor: float = Field(0.003, ge=0.0, description="noise added to the datasheet's, across the surface [m]")
+    footprint: float = Field(0.0, ge=0.0, description="share of a zone's half width counted as noise on slanted "
+                                                      "surfaces (1 for a sensor that integrates over its zones)")
+    cauchy: float = Field(2.0, gt=0.0, description="scale of the Cauchy loss in sigmas; large switches it off")
+    gate: float = Field(0.12, gt=0.0, description="farthest map point that a zone may match [m]")
+    acquisition_gate: float = Field(0.5, gt=0.0, description="the same before the first fit and when lost [m]")
+    min_cosine: float = Field(0.15, ge=0.0, lt=1.0, description="least cosine of incidence for a match")
+    planarity_power: float = Field(1.0, ge=0.0, description="weight = planarity ** power; 0 switches it off")
+
+
+class GyroSettings(Settings):
+    """Gyro factors."""
+
+    enabled: bool = True
+    scale: float = Field(1.5, gt=0.0, description="factor on the datasheet's noise")
+    cauchy: float = Field(4.0, gt=0.0, description="scale of the Cauchy loss in sigmas")
+    bias_sigma: float = Field(0.02, gt=0.0, description="spread of the bias at start [rad/s]")
+    bias_walk: float = Field(1e-4, gt=0.0, description="random walk of the bias [rad/s/sqrt(s)]")
+    rest_time: float = Field(0.5, ge=0.0, description="initial time at rest whose average gives the bias; 0 to "
+                                                      "estimate it from the spread alone [s]")
+    rest_rate: float = Field(0.05, gt=0.0, description="scatter above which the start was no rest [rad/s]")
+
+
+class StrainSettings(Settings):
+    """Strain factors: the two curvatures only, as (theta, kappa) says nothing of the other components."""
+
+    enabled: bool = True
+    scale: float = Field(1.5, gt=0.0, description="factor on the datasheet's noise")
+    cauchy: float = Field(4.0, gt=0.0, description="scale of the Cauchy loss in sigmas")
+
+
+class TrackerSettings(Settings):
+    """External pose factors."""
+
+    enabled: bool = True
+    sigma_position: float = Field(0.001, gt=0.0, description="where the message states none [m]")
+    sigma_rotation_deg: float = Field(1.0, gt=0.0, description="where the message states none [deg]")
+    cauchy: float = Field(4.0, gt=0.0, description="scale of the Cauchy loss in sigmas")
+
+
+class GravitySettings(Settings):
+    """Accelerometer as gravity's direction, while the motion is quasi-static."""
+
+    enabled: bool = False
+    sigma: float = Field(0.3, gt=0.0, description="noise with the motion's own acceleration [m/s^2]")
+    gate: float = Field(0.5, gt=0.0, description="a specific force farther from g is not used [m/s^2]")
+    up: tuple[float, float, float] = Field((0.0, 0.0, 1.0), description="direction against gravity in `map`")
+
+
+class SolverSettings(Settings):
+    """Gauss-Newton with damping."""
+
+    max_iterations: int = Field(4, ge=1, description="per step while tracking")
+    acquisition_iterations: int = Field(40, ge=1, description="per step before the first fit and when lost")
+    tolerance: float = Field(2e-4, gt=0.0, description="a smaller move of every pose ends the step [m, rad]")
+    relinearise: float = Field(1e-3, gt=0.0, description="a knot column that moved farther is linearised anew [m, rad]")
+
+
+class RecoverySettings(Settings):
+    """Noticing that the filter is lost, and finding back."""
+
+    enabled: bool = True
+    min_inliers: float = Field(0.5, ge=0.0, le=1.0, description="share of fitting zones below which a body is suspect")
+    patience: float = Field(0.4, ge=0.0, description="time that a suspicion must last [s]")
+    hypotheses: int = Field(400, ge=1, description="shapes drawn from the shape prior when lost")
+    refined: int = Field(6, ge=1, description="how many of the best are refined")
+
+
+class EstimatorSettings(Settings):
+    """The sliding-window filter."""
+
+    knot_period: float = Field(0.1, gt=0.0, description="time between knots [s]")
+    window: float = Field(1.0, gt=0.0, description="duration of the sliding window [s]")
+    lag: float = Field(0.3, ge=0.0, description="age of the smoothed output; at most the window [s]")
+    output_rate: float = Field(15.0, gt=0.0, description="steps per second of data without ToF sensors to set the pace")
+    node_spacing: float = Field(0.16, gt=0.0, description="greatest distance between nodes on the backbone [m]")
+    backbone_points: int = Field(61, ge=2, description="poses of the published backbone")
+    prior: PriorSettings = PriorSettings()
+    tof: TofSettings = TofSettings()
+    gyro: GyroSettings = GyroSettings()
+    strain: StrainSettings = StrainSettings()
+    tracker: TrackerSettings = TrackerSettings()
+    gravity: GravitySettings = GravitySettings()
+    solver: SolverSettings = SolverSettings()
+    recovery: RecoverySettings = RecoverySettings()
+
+
+def load_estimator_settings(name_or_path: str | Path) -> EstimatorSettings:
+    """Settings that come with the package by the robot's name (`engine`, `soft_arm`), or from a YAML file."""
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml"):
+        return load_settings(EstimatorSettings, path)
+    bundled = PRESETS_FOLDER / f"{name_or_path}.yaml"
+    if not bundled.is_file():
+        names = ", ".join(sorted(file.stem for file in PRESETS_FOLDER.glob("*.yaml")))
+        raise SettingsError(f"no estimator settings '{name_or_path}': give a .yaml file, or one of {names}")
+    return load_settings(EstimatorSettings, bundled)

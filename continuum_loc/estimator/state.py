@@ -1,0 +1,112 @@
+"""The state on its grid of times and arclengths.
+
+A *column* is the whole body at one knot time: N nodes of {T_map_body, strain, velocity} and a gyro bias for
+each IMU. Its tangent vector has 18 N + 3 I entries: node n at 18 n as [pose 6, strain 6, velocity 6], then
+the biases. Pose perturbations act on the right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from continuum_loc import lie, lie_kernels
+from continuum_loc.robot import RobotDescription
+
+NODE_DIM = 18
+POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
+
+
+class Grid:
+    """Where the nodes are: at the base, at every ring and the tip, and in between no farther than `spacing`.
+
+    s: (N,) arclengths [m]; ring_nodes: (R + 1,) nodes of the base and of the rings; biases: number of IMUs;
+    dim: length of a column's tangent vector.
+    """
+
+    def __init__(self, robot: RobotDescription, spacing: float):
+        anchors = np.unique(np.concatenate([[0.0], robot.ring_arclengths, [robot.length]]))
+        if anchors[-1] - anchors[-2] < 1e-6:
+            anchors = np.delete(anchors, -2 if len(anchors) > 2 else -1)
+        pieces = [np.linspace(a, b, int(np.ceil((b - a) / spacing - 1e-9)), endpoint=False)
+                  for a, b in zip(anchors[:-1], anchors[1:], strict=True)]
+        self.s = np.concatenate([*pieces, anchors[-1:]])
+        self.ring_nodes = np.array([self.node_at(s) for s in (0.0, *robot.ring_arclengths)])
+        self.nodes = len(self.s)
+        self.biases = len(robot.imu)
+        self.dim = NODE_DIM * self.nodes + 3 * self.biases
+        self.bias_offset = NODE_DIM * self.nodes
+
+    def node_at(self, s: float) -> int:
+        """The node at arclength s [m]; every ring has one."""
+        return int(np.argmin(np.abs(self.s - s)))
+
+    def segment(self, s: float) -> tuple[int, float]:
+        """The node below s and the distance from it [m]; s is clipped to the body."""
+        n = int(np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, self.nodes - 2))
+        return n, float(np.clip(s, self.s[0], self.s[-1]) - self.s[n])
+
+
+@dataclass(slots=True, eq=False)
+class Column:
+    """The body at one knot: time [s] since the filter's epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3)."""
+
+    time: float
+    T: np.ndarray
+    strain: np.ndarray
+    velocity: np.ndarray
+    bias: np.ndarray
+
+    def copy(self) -> Column:
+        return Column(self.time, self.T.copy(), self.strain.copy(), self.velocity.copy(), self.bias.copy())
+
+    def retract(self, delta: np.ndarray) -> Column:
+        """The column moved by a tangent vector (18 N + 3 I,)."""
+        moved = self.copy()
+        _retract(moved.T, moved.strain, moved.velocity, moved.bias, delta)
+        return moved
+
+    def minus(self, other: Column) -> np.ndarray:
+        """Tangent vector from `other` to this column: other.retract(self.minus(other)) is self."""
+        nodes = np.concatenate([lie.log(lie.inverse(other.T) @ self.T), self.strain - other.strain,
+                                self.velocity - other.velocity], axis=1)
+        return np.concatenate([nodes.ravel(), (self.bias - other.bias).ravel()])
+
+    def predict(self, dt: float) -> Column:
+        """The column dt later at constant body-frame velocity: the prior's mean."""
+        return Column(self.time + dt, self.T @ lie.exp(dt * self.velocity), self.strain.copy(), self.velocity.copy(),
+                      self.bias.copy())
+
+
+@njit(cache=True)
+def _retract(T, strain, velocity, bias, delta):
+    step, moved = np.empty((4, 4)), np.empty((4, 4))
+    nodes = T.shape[0]
+    for n in range(nodes):
+        lie_kernels.exp(delta[18 * n:18 * n + 6], step)
+        lie_kernels.compose(T[n], step, moved)
+        T[n] = moved
+        for i in range(6):
+            strain[n, i] += delta[18 * n + 6 + i]
+            velocity[n, i] += delta[18 * n + 12 + i]
+    for b in range(bias.shape[0]):
+        for i in range(3):
+            bias[b, i] += delta[18 * nodes + 3 * b + i]
+
+
+def shape_from_strain(T_map_base: np.ndarray, s: np.ndarray, strain: np.ndarray) -> np.ndarray:
+    """Poses (N, 4, 4) at s (N,) by integrating strain (N, 6) from the base: dT/ds = T eps^, midpoint rule."""
+    T = np.empty((len(s), 4, 4))
+    T[0] = T_map_base
+    steps = lie.exp(0.5 * (strain[1:] + strain[:-1]) * np.diff(s)[:, None])
+    for n, step in enumerate(steps):
+        T[n + 1] = T[n] @ step
+    return T
+
+
+def column_at_rest(grid: Grid, T_map_base: np.ndarray, strain: np.ndarray, time: float) -> Column:
+    """A motionless column with the given strain (N, 6)."""
+    return Column(time, shape_from_strain(T_map_base, grid.s, strain), strain.copy(), np.zeros_like(strain),
+                  np.zeros((grid.biases, 3)))

@@ -1,0 +1,74 @@
+"""The chain against dense algebra: solution, covariances, and marginalisation equal to the batch."""
+
+import numpy as np
+import pytest
+
+from continuum_loc.estimator.chain import Blocks, Chain, Message, SingularError
+
+D, K = 7, 6
+
+
+def random_chain(seed: int):
+    rng = np.random.default_rng(seed)
+    intervals = []
+    for _ in range(K - 1):
+        A = rng.normal(size=(4 * D, 2 * D))
+        intervals.append(Blocks(A.T @ A, rng.normal(size=2 * D)))
+    A = rng.normal(size=(2 * D, D))
+    return Message(A.T @ A, rng.normal(size=D)), intervals
+
+
+def dense(start, intervals):
+    size = D * (len(intervals) + 1)
+    H, g = np.zeros((size, size)), np.zeros(size)
+    H[:D, :D] += start.information
+    g[:D] += start.gradient
+    for k, block in enumerate(intervals):
+        H[D * k:D * (k + 2), D * k:D * (k + 2)] += block.H
+        g[D * k:D * (k + 2)] += block.g
+    return H, g
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_solution_and_covariances_equal_dense_algebra(seed):
+    start, intervals = random_chain(seed)
+    H, g = dense(start, intervals)
+    chain = Chain(D, start)
+    np.testing.assert_allclose(np.concatenate(chain.solve(intervals, 0)), np.linalg.solve(H, -g), atol=1e-9)
+    P = np.linalg.inv(H)
+    marginals, crosses = chain.covariances(K)
+    for k in range(K):
+        np.testing.assert_allclose(marginals[k], P[D * k:D * (k + 1), D * k:D * (k + 1)], atol=1e-9)
+    for k in range(K - 1):
+        np.testing.assert_allclose(crosses[k], P[D * k:D * (k + 1), D * (k + 1):D * (k + 2)], atol=1e-9)
+
+
+def test_marginalising_equals_the_batch_solution():
+    """Sliding a window of three columns over a linear problem ends where the batch over all columns does."""
+    start, intervals = random_chain(7)
+    H, g = dense(start, intervals)
+    batch = np.linalg.solve(H, -g)
+    chain, window = Chain(D, start), []
+    for block in intervals:
+        window.append(block)
+        offsets = chain.solve(window, len(window) - 1)
+        if len(window) == 3:
+            chain.forget_oldest()
+            del window[0]
+    np.testing.assert_allclose(offsets[-1], batch[-D:], atol=1e-9)
+
+
+def test_kept_messages_change_nothing():
+    start, intervals = random_chain(3)
+    chain = Chain(D, start)
+    chain.solve(intervals, 0)
+    intervals[3] = Blocks(intervals[3].H * 1.5, intervals[3].g + 1.0)
+    np.testing.assert_allclose(chain.solve(intervals, 3), Chain(D, start).solve(intervals, 0), atol=1e-10)
+
+
+def test_an_unobserved_direction_is_said():
+    start, intervals = random_chain(1)
+    start.information[:] = 0.0
+    intervals[0].H[0, :] = intervals[0].H[:, 0] = 0.0
+    with pytest.raises(SingularError, match="column 0"):
+        Chain(D, start).solve(intervals, 0)
