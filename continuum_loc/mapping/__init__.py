@@ -1,0 +1,1 @@
+"""Prior maps, their nearest-neighbour index, and what the sensors saw: reconstruction and anomalies."""
