@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from manifold3d import Manifold
@@ -18,6 +19,7 @@ from continuum_loc.simulator.solids import (
     Part,
     box,
     convex_part,
+    cut_hulls,
     cylinder,
     lathe,
     loft,
@@ -33,8 +35,8 @@ _CASING_RADIUS = (1.50, 1.47)  # at the inlet and at the outlet
 _RUB_STRIP_DEPTH = 0.012
 _CONTACT_AZIMUTH = 75.0  # the robot cannot reach farther round than this [deg]
 _CONTACT_END = 2.2
-_SECTION_POINTS = 13  # per side of a blade section
-_SPAN_SECTIONS = 15
+_SECTION_POINTS = 19  # per side of a blade section
+_SPAN_SECTIONS = 21
 _TITANIUM, _STEEL, _PAINT, _RUBBER = 0.55, 0.45, 0.75, 0.25
 
 
@@ -108,9 +110,36 @@ ROWS = (
 
 
 def engine_parts() -> list[Part]:
-    """All parts of the undamaged engine (scene S0)."""
+    """All parts of the engine as built (scene S0)."""
     blades = [_blade(row, index) for row in ROWS for index in range(row.count)]
     return [_casing(), _hub(), *blades, *_casing_fittings(), *_hub_fittings()]
+
+
+def leading_edge(blade: str, radius: float) -> np.ndarray:
+    """(3,) point on the leading edge of a blade (`rotor1_0`) at a distance [m] from the engine's axis."""
+    sections = _find_row(blade).sections(_index(blade))
+    edge = 0.5 * (sections[:, 0] + sections[:, -1])
+    radii = np.hypot(edge[:, 1], edge[:, 2])
+    return np.array([np.interp(radius, radii, edge[:, axis]) for axis in range(3)])
+
+
+def bitten(blade: Part, radius: float, size: float) -> tuple[Part, Manifold]:
+    """A blade with a round bite of diameter `size` [m] out of its leading edge, and the piece that went.
+
+    The contact pieces are re-cut finely, so that the robot feels the gap to about a centimetre.
+    """
+    cutter = Manifold.sphere(size / 2.0, 48).translate(leading_edge(blade.name, radius))
+    fine = _blade_hulls(_find_row(blade.name).sections(_index(blade.name)), chord_pieces=6, span_pieces=14)
+    hulls = cut_hulls(fine, cutter) if blade.hulls else ()
+    return replace(blade, solid=blade.solid - cutter, hulls=hulls), blade.solid ^ cutter
+
+
+def _find_row(blade: str) -> BladeRow:
+    return next(row for row in ROWS if row.name == blade.rpartition("_")[0])
+
+
+def _index(blade: str) -> int:
+    return int(blade.rpartition("_")[2])
 
 
 def _section(chord: float, camber: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -140,8 +169,8 @@ def _blade_hulls(sections: np.ndarray, chord_pieces: int = 2, span_pieces: int =
     upper, lower = sections[:, :side], sections[:, : side - 1 : -1]
     return tuple(
         np.concatenate([upper[a : b + 1, c : d + 1], lower[a : b + 1, c : d + 1]]).reshape(-1, 3)
-        for a, b in zip(spans, spans[1:], strict=False)
-        for c, d in zip(chords, chords[1:], strict=False)
+        for a, b in pairwise(spans)
+        for c, d in pairwise(chords)
     )
 
 
@@ -159,7 +188,7 @@ def _casing() -> Part:
         INLET + 0.05 - 0.05 * np.sin(lip_angle),
         casing_radius(INLET + 0.05) + lip_radius * (1.0 + np.cos(lip_angle)),
     ])
-    shell = lathe(np.concatenate([lip, bore, [[OUTLET, OUTER_RADIUS]]]), segments=240)
+    shell = lathe(np.concatenate([lip, bore, [[OUTLET, OUTER_RADIUS]]]), segments=300)
     for x, azimuth, radius in _PORTS:
         shell -= on_cylinder(cylinder(radius, 0.08), x, azimuth, float(casing_radius(x)))
     return Part("casing", shell, _casing_hulls(), _STEEL)
@@ -174,7 +203,7 @@ def _casing_hulls(step_deg: float = 5.0) -> Hulls:
     radius = np.concatenate([casing_radius(ends) * bulge, casing_radius(ends) + 0.06])
     return tuple(
         np.concatenate([wrap(x, np.radians(edge), radius) for edge in pair])
-        for pair in zip(edges, edges[1:], strict=False)
+        for pair in pairwise(edges)
     )
 
 
@@ -182,6 +211,7 @@ def _hub() -> Part:
     nose = _NOSE_END - (_NOSE_END - _NOSE_TIP) * np.cos(np.linspace(0.0, np.pi / 2.0, 15))
     stations = np.append(nose, [0.8, 1.4, 2.0, OUTLET])
     profile = np.column_stack([stations, hub_radius(stations)])
+    profile[0, 1] = 0.0  # exactly on the axis: a hole of 10 nm would be left otherwise
     solid = lathe(np.concatenate([profile, [[OUTLET, 0.0]]]), segments=180)
     return Part("hub", solid, _hub_hulls(stations), _PAINT)
 
@@ -207,7 +237,7 @@ _BOSSES = (
     (0.52, 14.0, 0.035, 0.07),
     (0.87, -20.0, 0.060, 0.04),
     (1.32, 8.0, 0.045, 0.06),
-    (1.75, -10.0, 0.040, 0.05),
+    (1.74, -10.0, 0.040, 0.05),
     (0.02, -22.0, 0.040, 0.06),
 )
 # Balance weights on the hub: x, azimuth [deg], circumferential width.
@@ -216,10 +246,7 @@ _WEIGHTS = ((1.33, -31.0, 0.10), (1.33, -9.0, 0.14), (1.33, 7.0, 0.08), (1.33, 2
 
 
 def _casing_fittings() -> list[Part]:
-    bosses = [
-        convex_part(f"boss_{i}", on_cylinder(cylinder(radius, 2.0 * height), x, azimuth, float(casing_radius(x))), _STEEL)
-        for i, (x, azimuth, radius, height) in enumerate(_BOSSES)
-    ]
+    bosses = [_boss(i, *place) for i, place in enumerate(_BOSSES)]
     junction = on_cylinder(box((0.12, 0.16, 0.18)), 0.86, 24.0, float(casing_radius(0.86)))
     axial = partial(cylinder, 0.022, segments=24)
     pipes = [
@@ -234,6 +261,11 @@ def _casing_fittings() -> list[Part]:
     return [*bosses, convex_part("junction_box", junction, _PAINT), *pipes, *panels]
 
 
+def _boss(index: int, x: float, azimuth_deg: float, radius: float, height: float) -> Part:
+    solid = on_cylinder(cylinder(radius, 2.0 * height), x, azimuth_deg, float(casing_radius(x)))
+    return convex_part(f"boss_{index}", solid, _STEEL)
+
+
 def _panel(name: str, x: tuple[float, float], azimuth_deg: tuple[float, float], height: float) -> Part:
     """A raised patch of the casing's wall, in contact pieces of about 4 degrees."""
     inner = casing_radius(np.array(x)) - height
@@ -242,7 +274,7 @@ def _panel(name: str, x: tuple[float, float], azimuth_deg: tuple[float, float], 
     edges = np.radians(np.linspace(*azimuth_deg, count + 1))
     hulls = tuple(
         wrap(profile[:, :1], np.array(pair), profile[:, 1:]).reshape(-1, 3)
-        for pair in zip(edges, edges[1:], strict=False)
+        for pair in pairwise(edges)
     )
     return Part(name, lathe(profile, segments=12 * count, azimuth_deg=azimuth_deg), hulls, _PAINT)
 
@@ -264,8 +296,3 @@ def _bolt(index: int, azimuth_deg: float) -> Part:
     near = min(azimuth_deg, 360.0 - azimuth_deg) < _CONTACT_AZIMUTH
     return part if near else replace(part, hulls=())
 
-
-def broken_off(radius: float, x: float, tilt_deg: float, azimuth_deg: float) -> Manifold:
-    """A cutter that takes a blade's outer end: everything beyond `radius`, the break tilted along the chord."""
-    slab = box((1.2, 0.5, 1.0)).translate((0.0, 0.0, 0.5)).rotate((0.0, tilt_deg, 0.0))
-    return on_cylinder(slab, x, azimuth_deg, radius)

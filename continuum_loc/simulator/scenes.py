@@ -9,10 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+    from continuum_loc.simulator.solids import Part
+
+ENGINE_SCENES = tuple(f"S{i}" for i in range(10))
+BOX_SCENES = tuple(f"R{i}" for i in range(5))
+SCENE_NAMES = ENGINE_SCENES + BOX_SCENES
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
 
 
@@ -83,26 +91,30 @@ def load_scene(name_or_path: str | Path) -> Scene:
     name = str(name_or_path)
     if name in SCENE_NAMES:
         return _built(name)
+    if Path(name).suffix.lower() in MESH_SUFFIXES:
+        from continuum_loc.simulator.mesh_import import import_mesh
+
+        return import_mesh(Path(name))
     raise SceneError(f"no scene '{name}': give one of {', '.join(SCENE_NAMES)}, or the path of a "
                      f"{', '.join(MESH_SUFFIXES)} file")
 
 
-SCENE_NAMES = ("S0",)
-
-
 @lru_cache(maxsize=4)
 def _built(name: str) -> Scene:
-    from continuum_loc.simulator import engine_mesh
+    from continuum_loc.simulator import box, engine_mesh, engine_variants, scene_cache, solids
 
-    return scene_of_parts(name, engine_mesh.engine_parts())
+    if name in BOX_SCENES:
+        return box.box_scene(name)
+    sources = (Path(module.__file__) for module in (engine_mesh, engine_variants, solids, scene_cache))
+    return scene_cache.cached_scene(name, [Path(__file__), *sources], lambda: engine_variants.engine_variant(name))
 
 
-def scene_of_parts(name: str, parts: list, anomalies: tuple[Anomaly, ...] = ()) -> Scene:
-    """Unite parts (`solids.Part`) into a scene."""
-    from continuum_loc.simulator.solids import unite
+def scene_of_solid(name: str, solid: Manifold, owners: np.ndarray, parts: list[Part],
+                   anomalies: tuple[Anomaly, ...] = ()) -> Scene:
+    """The scene of united parts; `owners` (F,) is the index of each face's part (see `solids.unite`)."""
+    from continuum_loc.simulator.solids import mesh_of
 
-    vertices, faces, face_object = unite(parts)
-    reflectance = np.array([part.reflectance for part in parts])[face_object]
+    vertices, faces = mesh_of(solid)
+    reflectance = np.array([part.reflectance for part in parts])[owners]
     hulls = tuple(hull for part in parts for hull in part.hulls)
-    objects = tuple(part.name for part in parts)
-    return Scene(name, vertices, faces, face_object, objects, reflectance, hulls, anomalies)
+    return Scene(name, vertices, faces, owners, tuple(part.name for part in parts), reflectance, hulls, anomalies)

@@ -1,4 +1,5 @@
-"""Solids for procedurally made scenes: parts, their union into one watertight mesh, and the geometry's cache.
+"""Solids for procedurally made scenes: parts, their union into one watertight mesh,
+and how to place them.
 
 Map frame throughout; metres. `azimuth` turns about the map's x axis, from +z (0 deg) towards +y.
 """
@@ -12,7 +13,7 @@ from manifold3d import CrossSection, Manifold, Mesh64, OpType
 
 Hulls = tuple[np.ndarray, ...]
 
-_ROBUST_EDGE = 1e-7  # edges shorter than this are collapsed: float32 ray casters cannot see them
+_ROBUST_EDGE = 1e-5  # slivers thinner than this are collapsed: single-precision ray casters slip through them [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +32,15 @@ def convex_part(name: str, solid: Manifold, reflectance: float = 0.5) -> Part:
     return Part(name, solid, (vertices_of(solid),), reflectance)
 
 
-def unite(parts: list[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Union of all parts: vertices (V, 3), faces (F, 3) int32, and the index of each face's part (F,) int32."""
+def unite(parts: list[Part]) -> tuple[Manifold, np.ndarray]:
+    """Union of all parts, and the index of the part that each of its faces belongs to (F,) int32."""
     originals = [part.solid.as_original() for part in parts]
     union = Manifold.batch_boolean(originals, OpType.Add).simplify(_ROBUST_EDGE)
     mesh = union.to_mesh64()
     part_of_id = {original.original_id(): index for index, original in enumerate(originals)}
     runs = np.asarray(mesh.run_index, dtype=np.int64) // 3
     owners = [part_of_id[int(run)] for run in mesh.run_original_id]
-    return *mesh_of(union), np.repeat(np.array(owners, dtype=np.int32), np.diff(runs))
+    return union, np.repeat(np.array(owners, dtype=np.int32), np.diff(runs))
 
 
 def mesh_of(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
