@@ -1,0 +1,113 @@
+"""What the 3-D view and the moving picture show: the surroundings near the robot, and its body at chosen instants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from continuum_loc.evaluation.replay import ReplayResult
+from continuum_loc.evaluation.tracks import Track
+from continuum_loc.measurements import NANOSECONDS
+
+POINTS_PER_SPAN = 9
+CLOUD_SPAN = NANOSECONDS // 2  # a picture shows the ToF points of the half second before its instant
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Mesh (vertices (V, 3), faces (F, 3)) and prior map points (P, 3) near the robot; either may be empty."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    map_points: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The body at one instant: estimated and true backbone (B, 3), estimated rings (R, 3), recent ToF points (M, 3).
+    `truth` is empty where none was recorded."""
+
+    stamp: int
+    backbone: np.ndarray
+    truth: np.ndarray
+    rings: np.ndarray
+    points: np.ndarray
+
+
+def moments(result: ReplayResult, count: int, points: int, extra: np.ndarray | None = None) -> list[Moment]:
+    """At most `count` evenly spaced instants of the run and those in `extra` (stamps), each with at most `points`
+    ToF points."""
+    track = result.track
+    if len(track) == 0:
+        return []
+    chosen = np.unique(np.linspace(0, len(track) - 1, min(count, len(track))).round().astype(int))
+    if extra is not None:
+        chosen = np.union1d(chosen, np.searchsorted(track.stamps, extra).clip(0, len(track) - 1))
+    estimated = track.backbone if track.backbone is not None else smooth_backbone(track.T_map_ring)
+    return [Moment(int(track.stamps[k]), estimated[k], true_backbone(result.truth, int(track.stamps[k])),
+                   track.T_map_ring[k, 1:, :3, 3], recent_points(result, int(track.stamps[k]), points))
+            for k in chosen]
+
+
+def recent_points(result: ReplayResult, stamp: int, most: int) -> np.ndarray:
+    """Every n-th of the ToF points placed in the half second before `stamp`, so that at most `most` (M, 3) are left."""
+    cloud = result.cloud
+    recent = cloud.points[(cloud.stamps > stamp - CLOUD_SPAN) & (cloud.stamps <= stamp)]
+    return recent[:: max(1, -(-len(recent) // most))]
+
+
+def true_backbone(truth: Track, stamp: int) -> np.ndarray:
+    """(B, 3) curve through the true poses at `stamp`; empty outside the recorded truth."""
+    if len(truth) < 2 or not truth.stamps[0] <= stamp <= truth.stamps[-1]:
+        return np.empty((0, 3))
+    return smooth_backbone(truth.at(np.array([stamp])))[0]
+
+
+def smooth_backbone(T_map_ring: np.ndarray) -> np.ndarray:
+    """(K, B, 3) cubic Hermite curve through poses (K, R + 1, 4, 4) along their tangents (body x)."""
+    start, end = T_map_ring[:, :-1, None, :3], T_map_ring[:, 1:, None, :3]
+    chord = np.linalg.norm(end[..., 3] - start[..., 3], axis=-1, keepdims=True)
+    u = np.linspace(0.0, 1.0, POINTS_PER_SPAN)[None, None, :, None]
+    curve = ((1 + 2 * u) * (1 - u) ** 2 * start[..., 3] + u * (1 - u) ** 2 * chord * start[..., 0]
+             + u**2 * (3 - 2 * u) * end[..., 3] - u**2 * (1 - u) * chord * end[..., 0])
+    return curve.reshape(len(curve), -1, 3)
+
+
+def surroundings(result: ReplayResult, mesh: tuple[np.ndarray, np.ndarray] | None, map_points: np.ndarray | None,
+                 reach: float, most_faces: int, most_points: int) -> Surroundings:
+    """The part of the scene's mesh (vertices, faces) and of the prior map inside the box that reaches `reach` [m]
+    beyond everything the body swept, thinned to the given numbers."""
+    track = result.track if len(result.track) else result.truth
+    body = smooth_backbone(track.T_map_ring).reshape(-1, 3)
+    low, high = (body.min(axis=0) - reach, body.max(axis=0) + reach) if len(body) else (-np.inf, np.inf)
+    vertices, faces = np.empty((0, 3)), np.empty((0, 3), int)
+    if mesh is not None and len(body):
+        vertices, faces = thinned(*clipped(*mesh, low, high), most_faces)
+    points = map_points if map_points is not None else np.empty((0, 3))
+    points = points[np.all((points >= low) & (points <= high), axis=1)]
+    return Surroundings(vertices, faces, points[:: max(1, -(-len(points) // most_points))])
+
+
+def clipped(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray,
+            high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh inside an axis-aligned box, its faces cut at the box's sides."""
+    from trimesh.intersections import slice_faces_plane
+
+    vertices, faces = np.array(vertices), np.array(faces)
+    for axis in range(3):
+        for origin, sign in ((low, 1.0), (high, -1.0)):
+            vertices, faces, _ = slice_faces_plane(vertices, faces, sign * np.eye(3)[axis], origin)
+    return vertices, faces
+
+
+def thinned(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with at most about `most_faces` faces, by quadric decimation."""
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices),
+                                     o3d.utility.Vector3iVector(faces.astype(np.int32)))
+    mesh.remove_duplicated_vertices()
+    if len(faces) > most_faces:
+        mesh = mesh.simplify_quadric_decimation(most_faces)
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
