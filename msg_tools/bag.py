@@ -147,7 +147,7 @@ def contract_topics(path: Path, connections: list, namespace: str | None) -> dic
 
 
 def split_topic(name: str, type_name: str) -> tuple[str, str] | None:
-    """(namespace, relative topic) of an absolute name, or None outside the contract. Absolute topics are everybody's: '*'."""
+    """(namespace, relative topic) of an absolute name, or None outside the contract; '*' owns the absolute topics."""
     if name in TOPICS:
         return ("*", name) if TOPICS[name].type == type_name else None
     parts = name.strip("/").split("/")

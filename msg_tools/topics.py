@@ -1,4 +1,4 @@
-"""The contract of topics: name, type, quality of service, and how its content is written and read. The only such list."""
+"""The contract of topics: name, type, quality of service, how its content is written and read. The only such list."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from msg_tools import convert
 from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
-from msg_tools.records import CloudRecord, PathRecord, PosesRecord, TipRecord
+from msg_tools.records import CloudRecord, PosesRecord, TipRecord
 
 TRACKER = "tracker/"
 
@@ -67,7 +67,8 @@ TOPICS: dict[str, Topic] = {
     "imu/mag": Topic("sensor_msgs/msg/MagneticField", convert.field_message, _read(convert.field_sample), depth=128),
     "strain": Topic("std_msgs/msg/Float64MultiArray", convert.strain_message, _strain, depth=32),
     TRACKER: Topic(_POSE, convert.tracker_message, _tracker, depth=64),
-    "joint_states": Topic("sensor_msgs/msg/JointState", convert.encoder_message, _read(convert.encoder_sample), depth=64),
+    "joint_states": Topic("sensor_msgs/msg/JointState", convert.encoder_message, _read(convert.encoder_sample),
+                          depth=64),
     "ground_truth/poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.truth_sample), depth=64),
     "poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.poses_record)),
     "backbone": Topic("nav_msgs/msg/Path", _path, _read(convert.path_record)),
