@@ -1,0 +1,259 @@
+"""Curves through the magnet and the modules: the paper's three (eqs. 11-24), each in two forms.
+
+All take `points` (N, 3) [m] from the magnet on, and unit `tangents` (N, 3) there, in a frame whose x is the
+magnet's axis, and give points (samples, 3) of the curve in that frame.
+
+The *projected* forms are the paper's: points and tangents go to the (r, axis) half plane (eq. 12), the curve is
+fitted there and turned back by one mean direction (eqs. 23-24). With r >= 0 an S-shape folds over, and bending
+out of a plane is lost. The *spatial* forms work on the points as they are and hold for both. A straight robot
+is a line in either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+CurveMethod = Literal["quadratic_bezier", "cubic_bezier", "kasa_arc"]
+PARALLEL = 1e-6  # sine of the angle below which two tangents count as parallel
+STRAIGHT = 1e-5  # sagitta over chord below which an arc is drawn as its line
+ARC_TOLERANCE = 7e-4  # m rms: points farther from their circle are no single arc
+
+
+def fit_curve(points: np.ndarray, tangents: np.ndarray, method: CurveMethod = "kasa_arc", projected: bool = False,
+              samples: int = 61) -> np.ndarray:
+    """(samples, 3) points along the curve of the named method, from the first of `points` to the last."""
+    forms = PROJECTED if projected else SPATIAL
+    if method not in forms:
+        raise ValueError(f"no curve '{method}'; valid: {', '.join(forms)}")
+    points, tangents = np.asarray(points, float), np.asarray(tangents, float)
+    if points.ndim != 2 or points.shape[1] != 3 or points.shape != tangents.shape or len(points) < 3:
+        raise ValueError(f"expected points and tangents (N >= 3, 3), got {points.shape} and {tangents.shape}")
+    return forms[method](points, tangents, samples)
+
+
+# The paper's projected forms
+
+
+def project(vectors: np.ndarray) -> np.ndarray:
+    """(N, 2) distance from the axis and position along it, eq. 12."""
+    return np.column_stack([np.hypot(vectors[:, 1], vectors[:, 2]), vectors[:, 0]])
+
+
+def lift(planar: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(C, 3) curve points in space from the half plane (C, 2), eqs. 23-24 (summed over the points there are)."""
+    total = np.hypot(points[:, 1], points[:, 2]).sum()
+    wy, wz = points[:, 1:].sum(axis=0) / total if total > 0.0 else (1.0, 0.0)
+    return np.column_stack([planar[:, 1], wy * planar[:, 0], wz * planar[:, 0]])
+
+
+def projected_quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
+    """Eqs. 11-14. The control point is where neighbouring tangents meet; a chord where they do not meet between.
+
+    The sign of the printed kappa (eq. 14) is the opposite of the intersection's and is mended here.
+    """
+    p, n = project(points), project(tangents)
+    chord = np.diff(p, axis=0)
+    denominator = _cross(n[:-1], n[1:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kappa = _cross(chord, n[1:]) / denominator
+    length = np.linalg.norm(chord, axis=1)
+    meets = (np.abs(denominator) > PARALLEL) & (kappa > 0.0) & (kappa < 2.0 * length)
+    control = np.where(meets[:, None], p[:-1] + np.where(meets, kappa, 0.0)[:, None] * n[:-1], p[:-1] + 0.5 * chord)
+    return lift(_quadratic_chain(p[:-1], control, p[1:], samples), points)
+
+
+def projected_cubic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
+    """Eqs. 15-16."""
+    return lift(cubic_bezier(project(points), None, samples), points)
+
+
+def projected_kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
+    """Eqs. 17-22."""
+    return lift(_arc_or_line(project(points), samples), points)
+
+
+# The same in space
+
+
+def quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
+    """Two quadratic pieces from each point to the next, which keep both tangents.
+
+    Tangents in space do not meet in general, and on an S-shape not between the points, so one piece cannot keep
+    both; two can always, with the control polygon of the biarc.
+    """
+    start, middle, end, first, second = _biarc_polygon(points, tangents)
+    return _quadratic_chain(_interleave(start, middle), _interleave(first, second), _interleave(middle, end), samples)
+
+
+def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) -> np.ndarray:
+    """One cubic through four points at t = 0, 1/3, 2/3, 1 (eqs. 15-16 hold in any dimension)."""
+    if len(points) != 4:
+        raise ValueError(f"a cubic Bezier passes through exactly 4 points, got {len(points)}")
+    inner = np.array([1.0 / 3.0, 2.0 / 3.0])
+    basis = _bernstein(inner)
+    controls = np.linalg.solve(basis[:, 1:3], points[1:3] - basis[:, [0, 3]] @ points[[0, 3]])
+    return _bernstein(np.linspace(0.0, 1.0, samples)) @ np.vstack([points[0], controls, points[3]])
+
+
+def kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
+    """The circle of least squares in the plane of least squares (SVD), where one arc explains the points;
+    else a chain of biarcs through points and tangents, which is still arcs, but as many as an S-shape needs."""
+    centre = points.mean(axis=0)
+    _, size, axes = np.linalg.svd(points - centre, full_matrices=False)
+    planar = (points - centre) @ axes[:2].T
+    fit = kasa_circle(planar)
+    off_circle = np.linalg.norm(planar - fit[:2], axis=1) - fit[2] if fit is not None else size[1] / len(points)**0.5
+    rms = np.sqrt(np.mean(off_circle**2) + size[2] ** 2 / len(points))
+    if rms > ARC_TOLERANCE:
+        return biarc_chain(points, tangents, samples)
+    return centre + _arc_or_line(planar, samples) @ axes[:2]
+
+
+def biarc_chain(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
+    """Two arcs from each point to the next, tangents continuous throughout."""
+    start, middle, end, first, second = _biarc_polygon(points, tangents)
+    starts, ends = _interleave(start, middle), _interleave(middle, end)
+    headings = _interleave(first - start, second - middle)
+    headings /= np.linalg.norm(headings, axis=1, keepdims=True)
+    piece, u = _pieces(len(starts), samples)
+    chord = ends - starts
+    along = np.einsum("ij,ij->i", chord, headings)
+    aside = chord - along[:, None] * headings
+    offset = np.linalg.norm(aside, axis=1)
+    half_turn = np.arctan2(offset, along)
+    curvature = 2.0 * offset / np.einsum("ij,ij->i", chord, chord)
+    normal = aside / np.maximum(offset, 1e-300)[:, None]
+    turn = 2.0 * half_turn[piece] * u
+    length = np.where(curvature > 0.0, 2.0 * half_turn / np.maximum(curvature, 1e-300), along)[piece] * u
+    forward = length * np.sinc(turn / np.pi)
+    sideways = length * np.sin(0.5 * turn) * np.sinc(0.5 * turn / np.pi)
+    return starts[piece] + forward[:, None] * headings[piece] + sideways[:, None] * normal[piece]
+
+
+Fit = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+PROJECTED: dict[str, Fit] = {"quadratic_bezier": projected_quadratic_bezier, "cubic_bezier": projected_cubic_bezier,
+                             "kasa_arc": projected_kasa_arc}
+SPATIAL: dict[str, Fit] = {"quadratic_bezier": quadratic_bezier, "cubic_bezier": cubic_bezier, "kasa_arc": kasa_arc}
+
+
+# Shared parts
+
+
+def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
+    """(3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20; None when straight."""
+    mean = planar.mean(axis=0)
+    scale = np.abs(planar - mean).max()
+    if scale == 0.0:
+        raise ValueError("all points of the curve coincide")
+    x, y = ((planar - mean) / scale).T  # centred and scaled, the normal matrix is as well conditioned as can be
+    D = np.column_stack([2.0 * x, 2.0 * y, np.ones_like(x)])
+    (xc, yc, sigma), _, rank, _ = np.linalg.lstsq(D, x * x + y * y, rcond=1e-10)
+    radius = np.sqrt(xc * xc + yc * yc + sigma)
+    if rank < 3 or 1.0 / (8.0 * radius) < STRAIGHT:
+        return None
+    return np.array([mean[0] + scale * xc, mean[1] + scale * yc, scale * radius])
+
+
+def _arc_or_line(planar: np.ndarray, samples: int) -> np.ndarray:
+    """(samples, 2) along the Kasa circle from the first point's polar angle to the last's, eqs. 21-22."""
+    circle = kasa_circle(planar)
+    t = np.linspace(0.0, 1.0, samples)[:, None]
+    if circle is None:
+        return _line(planar, t)
+    angle = np.unwrap(np.arctan2(planar[:, 1] - circle[1], planar[:, 0] - circle[0]))
+    sweep = angle[0] + (angle[-1] - angle[0]) * t
+    return circle[:2] + circle[2] * np.hstack([np.cos(sweep), np.sin(sweep)])
+
+
+def _line(planar: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Points at t of the least-squares line between the first and the last point's feet on it."""
+    mean = planar.mean(axis=0)
+    direction = np.linalg.svd(planar - mean)[2][0]
+    foot = (planar[[0, -1]] - mean) @ direction
+    return mean + (foot[0] + (foot[1] - foot[0]) * t) * direction
+
+
+def _biarc_polygon(points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Start, joint, end and the two inner control points of the biarc between neighbours, (N - 1, 3) each.
+
+    Both arms have the length d for which the middle arm of the polygon is 2 d long.
+    """
+    start, end, t0, t1 = points[:-1], points[1:], tangents[:-1], tangents[1:]
+    chord = end - start
+    square = np.einsum("ij,ij->i", chord, chord)
+    forward = np.einsum("ij,ij->i", chord, t0 + t1)
+    spread = 2.0 * (1.0 - np.einsum("ij,ij->i", t0, t1))
+    # The positive root of spread d^2 + 2 forward d - square = 0, without cancellation for parallel tangents.
+    d = (square / (forward + np.sqrt(forward**2 + spread * square)))[:, None]
+    first, second = start + d * t0, end - d * t1
+    return start, 0.5 * (first + second), end, first, second
+
+
+def _interleave(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.stack([a, b], axis=1).reshape(-1, a.shape[1])
+
+
+def _pieces(count: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which piece each of `samples` even steps lies on, and how far along it (0..1)."""
+    position = np.linspace(0.0, count, samples)
+    piece = np.minimum(position.astype(int), count - 1)
+    return piece, position - piece
+
+
+def _quadratic_chain(start: np.ndarray, control: np.ndarray, end: np.ndarray, samples: int) -> np.ndarray:
+    """(samples, D) along quadratic Bezier pieces, eq. 13."""
+    piece, u = _pieces(len(start), samples)
+    u = u[:, None]
+    return (1 - u) ** 2 * start[piece] + 2 * (1 - u) * u * control[piece] + u**2 * end[piece]
+
+
+def _bernstein(t: np.ndarray) -> np.ndarray:
+    """(T, 4) cubic blending functions."""
+    return np.stack([(1 - t) ** 3, 3 * (1 - t) ** 2 * t, 3 * (1 - t) * t**2, t**3], axis=-1)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+# What is done with a curve
+
+
+def arclength(points: np.ndarray) -> np.ndarray:
+    """(C,) length along the polyline [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
+    """(F, 3) points at fractions (F,) of the curve's length."""
+    s = arclength(points)
+    return np.column_stack([np.interp(np.asarray(fractions) * s[-1], s, column) for column in points.T])
+
+
+def extended(points: np.ndarray, length: float) -> np.ndarray:
+    """The curve carried on to `length` [m] with the curvature of its end, or as it is when that long already."""
+    s = arclength(points)
+    missing = length - s[-1]
+    if missing <= 1e-9:
+        return points
+    back = at_fractions(points, np.array([1.0 - 0.2, 1.0 - 0.1, 1.0]))
+    before, after = back[1] - back[0], back[2] - back[1]
+    bend = np.cross(before, after)
+    step = 0.1 * s[-1]
+    angle = np.arctan2(np.linalg.norm(bend), before @ after) / step  # curvature of the end
+    axis = bend / max(np.linalg.norm(bend), 1e-300)
+    # The chord of the last step points along the tangent half a step before the end.
+    tangent = _rotate(after / np.linalg.norm(after), axis, 0.5 * angle * step)
+    run = np.linspace(0.0, missing, max(2, int(np.ceil(len(points) * missing / s[-1]))) + 1)[1:, None]
+    turn = angle * run
+    normal = np.cross(axis, tangent)
+    ahead = run * np.sinc(turn / np.pi) * tangent + run * np.sin(turn / 2) * np.sinc(turn / (2 * np.pi)) * normal
+    return np.vstack([points, points[-1] + ahead])
+
+
+def _rotate(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
+    """`vector`, perpendicular to `axis`, turned about it."""
+    return np.cos(angle) * vector + np.sin(angle) * np.cross(axis, vector)
