@@ -1,0 +1,21 @@
+"""The continuous-time sliding-window filter. Start with `window.py`."""
+
+from __future__ import annotations
+
+__all__ = ["Estimate", "EstimatorSettings", "SlidingWindowFilter", "load_estimator_settings"]
+
+
+def __getattr__(name: str):
+    if name == "SlidingWindowFilter":
+        from continuum_loc.estimator.window import SlidingWindowFilter
+
+        return SlidingWindowFilter
+    if name == "Estimate":
+        from continuum_loc.estimator.estimate import Estimate
+
+        return Estimate
+    if name in ("EstimatorSettings", "load_estimator_settings"):
+        from continuum_loc.estimator import settings
+
+        return getattr(settings, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,75 @@
+"""The contract that every sensor's factor keeps; a new sensor is one file beside this one and an entry in FACTORS.
+
+A factor turns a measurement into a *row* when it arrives (a tuple of floats and arrays, in the body frame of its
+node), stacks the rows of an interval into arrays once, and adds their normal equations to the interval's blocks
+each time that the interval is linearised.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.estimator.state import Column, Grid
+from continuum_loc.robot import RobotDescription
+
+
+class MeasurementError(ValueError):
+    """A measurement that cannot be used; `reason` is the short name under which it is counted."""
+
+    def __init__(self, reason: str, message: str):
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(slots=True)
+class FactorReport:
+    """How an interval's measurements of one kind fit: robust cost, sum of squared normalised residuals and their
+    number, and for each sensor its [usable, fitting] counts."""
+
+    cost: float = 0.0
+    squared: float = 0.0
+    count: int = 0
+    fits: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+class Factor(ABC):
+    """One kind of sensor on one robot."""
+
+    name: ClassVar[str]
+    consumes: ClassVar[type]
+
+    def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
+        self.robot, self.grid, self.settings = robot, grid, settings
+
+    @abstractmethod
+    def row(self, measurement: Any) -> tuple:
+        """The measurement in the body frame of its node. Raises MeasurementError where it cannot be used."""
+
+    @abstractmethod
+    def stack(self, times: np.ndarray, rows: list[tuple]) -> tuple:
+        """Arrays of all rows of an interval; `times` (M,) seconds from the interval's start."""
+
+    @abstractmethod
+    def linearise(self, batch: tuple, a: Column, b: Column, blocks: Blocks) -> FactorReport:
+        """Add the normal equations of `batch` between the columns a and b."""
+
+
+def require_finite(values: np.ndarray, what: str, sensor: str) -> None:
+    """Raise MeasurementError unless every value is finite."""
+    if not np.all(np.isfinite(values)):
+        raise MeasurementError("not finite", f"{what} of '{sensor}' is not finite: {np.asarray(values).tolist()}")
+
+
+def known_sensor(sensors: dict[str, Any], name: str, kind: str) -> Any:
+    """The entry of `name`, or MeasurementError listing the valid names."""
+    try:
+        return sensors[name]
+    except KeyError:
+        raise MeasurementError("unknown frame", f"{kind} frame '{name}' is not in the robot description; valid: "
+                                                f"{', '.join(sensors)}") from None

@@ -1,0 +1,167 @@
+"""ToF: point-to-plane against the prior map (paper eqs. 1-4), associated anew whenever its interval is linearised.
+
+All zones of one frame share (s, t), so their residuals gather in one 6x6 information block in the body frame, which
+is chained once through the interpolation. With b = R^T n the row of a zone is [b, q x b] for a right perturbation.
+The noise acts along the beam: a hit at incidence n . d counts with variance sigma_d^2 (n . d)^2 plus the floor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from continuum_loc import lie_kernels
+from continuum_loc.estimator import gp
+from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, known_sensor
+from continuum_loc.estimator.state import VELOCITY
+from continuum_loc.mapping.voxel_index import nearest_facing
+from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
+
+FIT_SIGMAS = 3.0  # a zone within so many sigmas of its surface counts as fitting
+HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
+
+
+class TofFactor(Factor):
+    """Zones of a ToF frame against the map's surface; `index` is the map's lookup, None switches the factor off."""
+
+    name = "tof"
+    consumes = TofFrame
+
+    def __init__(self, robot, grid, settings, prior_map=None, index=None):
+        super().__init__(robot, grid, settings)
+        self.gate = settings.tof.gate
+        self.weights = dict.fromkeys((sensor.name for sensor in robot.tof), 1.0)
+        self._sensors = {sensor.name: (number, grid.node_at(robot.sensor_arclength(sensor.name)),
+                                       sensor.mount.T_ring_sensor) for number, sensor in enumerate(robot.tof)}
+        self._names = list(self._sensors)
+        self._index = index
+        if prior_map is not None:
+            self._cloud, self._normals = np.ascontiguousarray(prior_map.points), np.ascontiguousarray(prior_map.normals)
+            self._planarity = prior_map.planarity**settings.tof.planarity_power
+            self._map_variance = prior_map.sigma**2
+        model = robot.tof_model
+        self._half_zone = np.tan(np.radians(model.fov_deg) / 2.0) / max(model.rows, model.columns)
+
+    def row(self, measurement: TofFrame) -> tuple:
+        number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, "ToF")
+        if self._index is None:
+            raise MeasurementError("no map", "ToF frames need a prior map")
+        model = self.robot.tof_model
+        points = np.asarray(measurement.points, float)
+        if points.shape != (model.rows * model.columns, 3):
+            raise MeasurementError("wrong size", f"ToF frame of '{measurement.sensor}' has points {points.shape}; "
+                                                 f"the robot description says {model.rows} x {model.columns} zones")
+        with np.errstate(invalid="ignore"):
+            ranges = np.linalg.norm(points, axis=1)
+            usable = np.isfinite(ranges) & (ranges >= model.min_range) & (ranges <= model.max_range)
+        half = np.isin(measurement.status, TOF_HALF_CONFIDENT)
+        usable &= (measurement.status == TOF_VALID) | half
+        distance = np.where(usable, ranges, 1.0)
+        variance = np.square(model.sigma(distance)) * np.where(half, HALF_CONFIDENCE_VARIANCE, 1.0)
+        q = np.where(usable[:, None], points, 0.0) @ T_ring_sensor[:3, :3].T
+        rays = q / distance[:, None]
+        return number, node, q + T_ring_sensor[:3, 3], rays, np.where(usable, variance, np.inf)
+
+    def stack(self, times, rows):
+        return (times, *(np.array([row[i] for row in rows]) for i in range(5)))
+
+    def linearise(self, batch, a, b, blocks):
+        times, sensors, nodes, q, rays, variance = batch
+        options = self.settings.tof
+        weights = np.array([self.weights[self._names[s]] for s in sensors])
+        fits = np.zeros((len(times), 2))
+        cost, squared, count = _add(
+            blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, b.time - a.time, times, nodes, q, rays, variance,
+            weights, self._index.arrays, self._cloud, self._normals, self._planarity, self._map_variance, options.floor**2,
+            options.footprint * self._half_zone, options.cauchy, self.gate, options.min_cosine, fits)
+        by_sensor = np.zeros((len(self._names), 2))
+        np.add.at(by_sensor, sensors, fits)
+        return FactorReport(cost, squared, count, {self._names[s]: by_sensor[s] for s in np.unique(sensors)})
+
+
+@njit(cache=True)
+def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights, arrays, cloud, normals, planarity,
+         map_variance, floor2, footprint, cauchy, gate, min_cosine, fits):
+    W, V, M = lie_kernels.workspace()
+    J_work = np.empty((2, 6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    index, work = np.empty(24, np.int64), np.empty((6, 24))
+    H_body, g_body = np.empty((6, 6)), np.empty(6)
+    size = H.shape[0] // 2
+    cost, squared, count = 0.0, 0.0, 0
+    for f in range(times.shape[0]):
+        n = nodes[f]
+        gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
+        frame_cost, frame_squared, frame_count = frame_information(
+            T, q[f], rays[f], variance[f], weights[f], arrays, cloud, normals, planarity, map_variance, floor2, footprint,
+            cauchy, gate, min_cosine, H_body, g_body, fits[f])
+        gp.time_index(n, VELOCITY, size, index)
+        gp.add_local(H, g, index, H_body, g_body, J_pose, work)
+        cost += frame_cost
+        squared += frame_squared
+        count += frame_count
+    return cost, squared, count
+
+
+@njit(cache=True)
+def frame_information(T, q, rays, variance, weight, arrays, cloud, normals, planarity, map_variance, floor2,
+                      footprint, cauchy, gate, min_cosine, H, g, fit):
+    """Normal equations H (6, 6), g (6,) of one frame at T_map_body, and [usable, fitting] zones in `fit`.
+
+    Returns the robust cost, the sum of weighted squared residuals and the number of matched zones. An unmatched
+    zone costs what a residual at the gate would, so that losing matches never pays.
+    """
+    H[:, :] = 0.0
+    g[:] = 0.0
+    cost, squared, count = 0.0, 0.0, 0
+    row = np.empty(6)
+    c2 = cauchy * cauchy
+    fit[0] = 0.0
+    fit[1] = 0.0
+    for z in range(q.shape[0]):
+        if not np.isfinite(variance[z]):
+            continue
+        fit[0] += 1.0
+        a, b, c = q[z, 0], q[z, 1], q[z, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        w = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        d, e, f = rays[z, 0], rays[z, 1], rays[z, 2]
+        dx = T[0, 0] * d + T[0, 1] * e + T[0, 2] * f
+        dy = T[1, 0] * d + T[1, 1] * e + T[1, 2] * f
+        dz = T[2, 0] * d + T[2, 1] * e + T[2, 2] * f
+        hit, _ = nearest_facing(arrays, normals, x, y, w, dx, dy, dz, gate, min_cosine)
+        if hit < 0:
+            cost += 0.5 * weight * c2 * np.log1p(gate * gate / (c2 * (variance[z] + floor2)))
+            continue
+        nx, ny, nz = normals[hit, 0], normals[hit, 1], normals[hit, 2]
+        r = nx * (x - cloud[hit, 0]) + ny * (y - cloud[hit, 1]) + nz * (w - cloud[hit, 2])
+        cosine = nx * dx + ny * dy + nz * dz
+        cosine2 = cosine * cosine
+        spread = footprint * np.sqrt(a * a + b * b + c * c)
+        total = variance[z] * cosine2 + spread * spread * (1.0 - cosine2) + floor2 + map_variance
+        u2 = r * r / total
+        robust = 1.0 / (1.0 + u2 / c2)
+        alpha = weight * planarity[hit]
+        information = alpha * robust / total
+        row[0] = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
+        row[1] = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
+        row[2] = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
+        row[3] = b * row[2] - c * row[1]
+        row[4] = c * row[0] - a * row[2]
+        row[5] = a * row[1] - b * row[0]
+        for i in range(6):
+            scaled = information * row[i]
+            g[i] += scaled * r
+            for j in range(i + 1):
+                H[i, j] += scaled * row[j]
+        cost += 0.5 * alpha * c2 * np.log1p(u2 / c2)
+        squared += u2 * robust
+        count += 1
+        if u2 < FIT_SIGMAS * FIT_SIGMAS:
+            fit[1] += 1.0
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return cost, squared, count
+

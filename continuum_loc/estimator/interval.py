@@ -1,0 +1,51 @@
+"""The stretch between two knots: its measurements, and their normal equations at the current linearisation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.factors import Factor, FactorReport
+from continuum_loc.estimator.priors import Priors
+from continuum_loc.estimator.state import Column
+
+
+class Interval:
+    """Measurements with stamps in (start, start + duration], by factor, and their `Blocks`."""
+
+    def __init__(self, start: float, dim: int):
+        self.start = start
+        self.blocks = Blocks.zeros(dim)
+        self.reports: dict[str, FactorReport] = {}
+        self.changed = True
+        self._times: dict[Factor, list[float]] = {}
+        self._rows: dict[Factor, list[tuple]] = {}
+        self._batches: dict[Factor, tuple] = {}
+
+    def add(self, factor: Factor, time: float, row: tuple) -> None:
+        """Take a factor's row at `time` [s since the filter's epoch]."""
+        self._times.setdefault(factor, []).append(time - self.start)
+        self._rows.setdefault(factor, []).append(row)
+        self._batches.pop(factor, None)
+        self.changed = True
+
+    def rows(self, factor: Factor) -> list[tuple]:
+        """The rows of one factor, in order of arrival."""
+        return self._rows.get(factor, [])
+
+    def linearise(self, priors: Priors, a: Column, b: Column) -> None:
+        """Build the normal equations at the columns a and b."""
+        self.blocks.clear()
+        priors.add(self.blocks, a, b)
+        for factor, rows in self._rows.items():
+            if factor not in self._batches:
+                self._batches[factor] = factor.stack(np.array(self._times[factor]), rows)
+            report = factor.linearise(self._batches[factor], a, b, self.blocks)
+            self.reports[factor.name] = report
+            self.blocks.cost += report.cost
+        self.changed = False
+
+    def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
+        """Cost that the quadratic model gives at offsets from the linearisation point."""
+        x = np.concatenate([offset_a, offset_b])
+        return self.blocks.cost + float(x @ (self.blocks.g + 0.5 * (self.blocks.H @ x)))

@@ -1,0 +1,162 @@
+"""Prior factors of one interval: the Gaussian process in time and in arclength, rest strain, base and bias.
+
+An interval holds the time prior between its two columns and the factors of the *newer* column alone (its space
+prior, rest strain, base); those of the very first column are in the start message. So each factor stands once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from continuum_loc import lie, lie_kernels
+from continuum_loc.estimator import gp
+from continuum_loc.estimator.chain import Blocks, Message
+from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.estimator.state import NODE_DIM, POSE, STRAIN, VELOCITY, Column, Grid
+from continuum_loc.robot import RobotDescription
+
+BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
+BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
+
+
+class Priors:
+    """The prior of a robot with given settings, on a grid."""
+
+    def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
+        prior = settings.prior
+        self.grid = grid
+        self.memory = prior.memory
+        self.s = grid.s
+        self.rest = np.array(robot.backbone.rest_strain)
+        self.rest_information = 1.0 / np.square(robot.backbone.rest_strain_sigma)
+        self.velocity = 1.0 / np.array(prior.velocity)
+        self.strain_rate = 1.0 / np.array(prior.strain_rate)
+        self.strain = 1.0 / np.array(prior.strain)
+        self.velocity_slope = 1.0 / np.array(prior.velocity_slope)
+        self.bias_rate = 1.0 / settings.gyro.bias_walk**2
+        self.bias_information = 1.0 / settings.gyro.bias_sigma**2
+        self.initial_velocity = np.repeat(1.0 / np.square(prior.initial_velocity_sigma), 3)
+        self._set_base(robot)
+
+    def _set_base(self, robot: RobotDescription) -> None:
+        base, insertion = robot.base, robot.base.insertion
+        middle = 0.0 if insertion.mode == "fixed" else float(np.mean(insertion.range))
+        self.T_map_base = base.T_map_base @ lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
+        sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
+        rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
+        if insertion.mode != "fixed":
+            sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
+            rate[0] = 1.0
+        self.base_information, self.base_rate_information = sigma**-2.0, rate**-2.0
+
+    def start(self, column: Column) -> Message:
+        """The first column's own factors, linearised there: what is known before any measurement."""
+        D = self.grid.dim
+        H, g = np.zeros((D, D)), np.zeros(D)
+        self._add_column(H, g, column, 1.0)
+        for n in range(self.grid.nodes):
+            at = slice(NODE_DIM * n + VELOCITY, NODE_DIM * n + VELOCITY + 6)
+            H[at, at] += np.diag(self.initial_velocity)
+            g[at] += self.initial_velocity * column.velocity[n]
+        biases = np.arange(self.grid.bias_offset, D)
+        H[biases, biases] += self.bias_information
+        return Message(H, g)
+
+    def add(self, blocks: Blocks, a: Column, b: Column) -> None:
+        """Add the interval's time prior and the newer column's own factors; the cost too."""
+        dt, D = b.time - a.time, self.grid.dim
+        squared = _add_time(blocks.H, blocks.g, a.T, a.velocity, a.strain, b.T, b.velocity, b.strain, dt,
+                            self.velocity, self.strain_rate)
+        self._add_bias(blocks, a, b, dt)
+        squared += self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
+        blocks.cost += 0.5 * squared
+
+    def _add_column(self, H: np.ndarray, g: np.ndarray, column: Column, share: float) -> float:
+        """Space prior, rest strain and base of one column. Rest strain and base pose are one observation each, not
+        one per knot: a knot counts them by its `share` of the prior's memory."""
+        squared = _add_space(H, g, column.T, column.strain, column.velocity, self.s, self.strain, self.velocity_slope,
+                             self.rest, self.rest_information * share)
+        e = lie.log(lie.inverse(self.T_map_base) @ column.T[0])
+        J = lie.right_jacobian_inverse(e)
+        weight = self.base_information * share
+        H[:6, :6] += J.T @ (weight[:, None] * J)
+        g[:6] += J.T @ (weight * e)
+        at = np.arange(VELOCITY, VELOCITY + 6)
+        H[at, at] += self.base_rate_information * share
+        g[at] += self.base_rate_information * share * column.velocity[0]
+        return squared + weight @ e**2 + share * self.base_rate_information @ column.velocity[0] ** 2
+
+    def _add_bias(self, blocks: Blocks, a: Column, b: Column, dt: float) -> None:
+        D, weight = self.grid.dim, self.bias_rate / dt
+        older = np.arange(self.grid.bias_offset, D)
+        newer = older + D
+        e = weight * (b.bias - a.bias).ravel()
+        blocks.H[older, older] += weight
+        blocks.H[newer, newer] += weight
+        blocks.H[older, newer] -= weight
+        blocks.H[newer, older] -= weight
+        blocks.g[older] -= e
+        blocks.g[newer] += e
+
+
+@njit(cache=True)
+def _add_time(H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, strain_information):
+    W, V, M = lie_kernels.workspace()
+    e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
+    size = H.shape[0] // 2
+    squared = 0.0
+    for n in range(T_a.shape[0]):
+        gp.motion_error(T_a[n], v_a[n], T_b[n], v_b[n], dt, e, J, W, V, M)
+        gp.time_index(n, VELOCITY, size, index)
+        squared += gp.add_motion(H, g, index, e, J, dt, velocity_information)
+        for i in range(6):
+            older = NODE_DIM * n + STRAIN + i
+            newer = older + size
+            weight = strain_information[i] / dt
+            change = eps_b[n, i] - eps_a[n, i]
+            squared += weight * change * change
+            H[older, older] += weight
+            H[newer, newer] += weight
+            H[older, newer] -= weight
+            H[newer, older] -= weight
+            g[older] -= weight * change
+            g[newer] += weight * change
+    return squared
+
+
+@njit(cache=True)
+def _add_space(H, g, T, strain, velocity, s, strain_information, slope_information, rest, rest_information):
+    W, V, M = lie_kernels.workspace()
+    e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
+    weights = np.empty(6)
+    squared = 0.0
+    for n in range(T.shape[0]):
+        for i in range(6):
+            off = strain[n, i] - rest[i]
+            row = NODE_DIM * n + STRAIN + i
+            H[row, row] += rest_information[i]
+            g[row] += rest_information[i] * off
+            squared += rest_information[i] * off * off
+        if n == T.shape[0] - 1:
+            break
+        ds = s[n + 1] - s[n]
+        gp.motion_error(T[n], strain[n], T[n + 1], strain[n + 1], ds, e, J, W, V, M)
+        _segment_index(n, STRAIN, index)
+        squared += gp.add_motion(H, g, index, e, J, ds, strain_information)
+        gp.transport_error(T[n], velocity[n], T[n + 1], velocity[n + 1], e[:6], J[:6], W, V, M)
+        _segment_index(n, VELOCITY, index)
+        for i in range(6):
+            weights[i] = slope_information[i] / ds
+        squared += gp.add_rows(H, g, index, e[:6], J[:6], weights)
+    return squared
+
+
+@njit(cache=True)
+def _segment_index(n, rate_offset, index):
+    """Rows of [delta_n, x_n, delta_n+1, x_n+1] in a column, x the part at `rate_offset`."""
+    for i in range(6):
+        index[i] = NODE_DIM * n + POSE + i
+        index[6 + i] = NODE_DIM * n + rate_offset + i
+        index[12 + i] = NODE_DIM * (n + 1) + POSE + i
+        index[18 + i] = NODE_DIM * (n + 1) + rate_offset + i
