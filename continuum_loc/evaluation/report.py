@@ -64,10 +64,12 @@ class Page:
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What a run took place in: the scene's mesh (vertices, faces) and the prior map's points, where known."""
+    """What a run took place in: the scene's mesh (vertices, faces) and the prior map's points, where known.
+    `missing` says what could not be found."""
 
     mesh: tuple[np.ndarray, np.ndarray] | None = None
     map_points: np.ndarray | None = None
+    missing: str = ""
 
 
 def write_report(run: Run, context: Context | None = None) -> Path:
@@ -75,6 +77,28 @@ def write_report(run: Run, context: Context | None = None) -> Path:
     path = run.folder / "report.html"
     path.write_text(render(run_page(run, context or Context())))
     return path
+
+
+def context_of(run: Run) -> Context:
+    """The scene and the prior map that the run's configuration names, where they can still be had."""
+    from continuum_loc.evaluation.trials import scene_map
+    from continuum_loc.mapping.errors import MapError
+    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.simulator.scenes import SceneError, load_scene
+
+    mesh = map_points = None
+    named = run.configuration.get("map") or {}
+    try:
+        if run.configuration.get("scene"):
+            scene = load_scene(run.configuration["scene"])
+            mesh = (scene.vertices, scene.faces)
+        if "file" in named:
+            map_points = load_map(named["file"]).points
+        elif "scene" in named:
+            map_points = scene_map(named["scene"]).points
+    except (SceneError, MapError) as error:  # moved since: the report says so, and stands without it
+        return Context(mesh, map_points, missing=str(error))
+    return Context(mesh, map_points)
 
 
 def render(page: Page) -> str:
@@ -99,7 +123,7 @@ def run_page(run: Run, context: Context) -> Page:
     frame_of = {moment.stamp: index for index, moment in enumerate(shown)}
     around = surroundings(result, context.mesh, context.map_points, REACH, SCENE_FACES, MAP_POINTS)
     view = Part("The robot in its scene", "Drag to turn, scroll or pinch to zoom; the slider moves through time. "
-                "The prior map's points can be switched on in the legend.", name="view",
+                f"The prior map's points can be switched on in the legend. {context.missing}", name="view",
                 figure=chart(figures.scene_figure(around, shown, epoch)))
     groups = [[Part("Errors against truth, per ring", table=ring_table(summary))] if len(found) else [], [view],
               *_error_groups(run, found, epoch), _worst_group(run, found, worst, frame_of, epoch),

@@ -73,8 +73,8 @@ def load_study(name: str) -> StudyRun:
     names = study_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
-        raise StudyError(f"no study '{name}'{hint} Studies: {', '.join(names)}")
+        hint = f" (did you mean '{close[0]}'?)" if close else ""
+        raise StudyError(f"no study '{name}'{hint}; studies: {', '.join(names) or 'none'}")
     return importlib.import_module(f"continuum_loc.evaluation.studies.{name}").run
 
 

@@ -1,0 +1,348 @@
+"""The command line `continuum-loc`. Each command reads its arguments and calls the library; work is done there.
+
+Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+# Commands import what they need themselves, so that `--help` takes a tenth of a second.
+if TYPE_CHECKING:
+    from continuum_loc.evaluation.study import Claim
+
+OK, FAILED, USAGE = 0, 1, 2
+OUR_PACKAGES = ("continuum_loc", "msg_tools")
+
+app = typer.Typer(name="continuum-loc", no_args_is_help=True, add_completion=False, rich_markup_mode="markdown",
+                  pretty_exceptions_enable=False, help="Online localisation and shape of continuum robots.")
+map_app = typer.Typer(no_args_is_help=True, help="Build, convert and inspect prior maps.", rich_markup_mode="markdown")
+app.add_typer(map_app, name="map")
+console = Console()
+errors = Console(stderr=True)
+
+Robot = Annotated[str, typer.Option(help="`engine`, `soft_arm`, `hall_arm`, or your own description (YAML)")]
+Scene = Annotated[str, typer.Option(help="`S0`-`S9`, `R0`-`R4`, or your own mesh (STL, OBJ, PLY; metres)")]
+MapFile = Annotated[Path | None, typer.Option("--map", help="prior map: .npz .ply .pcd .xyz .csv, or a mesh")]
+Seed = Annotated[int, typer.Option(help="seed of everything random")]
+Runs = Annotated[Path, typer.Option("--out", help="folder of the numbered runs")]
+Settings = Annotated[Path | None, typer.Option(help="estimator settings (YAML); default: those of the robot")]
+
+
+def main() -> None:
+    """Entry point: errors of our own are told in one line, anything else is a bug and keeps its traceback."""
+    try:
+        app()
+    except Exception as error:
+        if type(error).__module__.split(".")[0] not in OUR_PACKAGES:
+            raise
+        errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(USAGE if isinstance(error, ValueError) else FAILED)
+
+
+@app.command()
+def demo(robot: Robot = "engine", scene: Scene = "S0",
+         trajectory: Annotated[str, typer.Option(help="named motion of the robot")] = "t1",
+         duration: Annotated[float, typer.Option(help="seconds of live running", min=2.0)] = 20.0,
+         seed: Seed = 0, out: Runs = Path("runs")) -> None:
+    """The whole path: simulator and estimator live over ROS 2, a bag, a report, and the same again from the bag.
+
+    Example: `continuum-loc demo --trajectory t2 --duration 10`
+    """
+    from continuum_loc.evaluation.demo import run_demo
+    from continuum_loc.evaluation.trials import Trial
+
+    with _busy() as status:
+        outcome = run_demo(Trial(robot, scene, trajectory, seed=seed, duration=duration), out, status.update)
+    console.print(_run_table(outcome.summary))
+    console.print(f"report  [link=file://{outcome.folder}/report.html]{outcome.folder}/report.html[/link]")
+    console.print(f"bag     {outcome.bag}")
+    if not outcome.identical:
+        errors.print("[bold red]failed:[/] two replays of the same bag differ", highlight=False)
+        raise typer.Exit(FAILED)
+    console.print("replay  two replays of the bag without ROS gave the same estimate, to the last bit")
+
+
+@app.command()
+def simulate(bag: Annotated[Path, typer.Argument(help="new bag folder to write")], robot: Robot = "engine",
+             scene: Scene = "S0", trajectory: Annotated[str, typer.Option(help="named motion of the robot")] = "t1",
+             profile: Annotated[str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")] = "full",
+             fidelity: Annotated[str, typer.Option(help="ToF model: `paper` or `vl53l5cx`")] = "paper",
+             duration: Annotated[float | None, typer.Option(help="seconds; default: the whole trajectory")] = None,
+             seed: Seed = 0) -> None:
+    """Record a simulated trial, sensors and truth, into a bag (rosbag2, MCAP) as fast as it goes.
+
+    Example: `continuum-loc simulate /tmp/trial --scene S3 --trajectory t2 --seed 4`
+    """
+    from continuum_loc.evaluation.trials import Trial, world, write_bag
+
+    trial = Trial(robot, scene, trajectory, profile=profile, fidelity=fidelity, seed=seed, duration=duration)
+    with _busy() as status:
+        status.update("building the scene and letting the robot come to rest")
+        made = world(trial)
+    seconds = made.trajectory.duration if duration is None else duration
+    counts = write_bag(bag, _progress(made.run(duration), "simulating", seconds))
+    _count_table(counts, f"{bag}: {seconds:g} s")
+
+
+@app.command()
+def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db3 file")], robot: Robot = "engine",
+           map_file: MapFile = None, scene: Annotated[str, typer.Option(help="scene shown in the report, and whose "
+           "map is taken where `--map` is not given")] = "S0", settings: Settings = None, seed: Seed = 0,
+           out: Runs = Path("runs")) -> None:
+    """Localise from a recorded bag without a ROS graph; the same bag gives the same estimate, bit for bit.
+
+    Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
+    """
+    from continuum_loc.estimator import load_estimator_settings
+    from continuum_loc.evaluation.replay import replay as run_replay
+    from continuum_loc.evaluation.replay import samples_of
+    from continuum_loc.evaluation.runs import new_run, save_run
+    from continuum_loc.evaluation.trials import make_filter, scene_map_file
+    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.robot import load_robot
+
+    description = load_robot(robot)
+    with _busy() as status:
+        status.update("loading the prior map")
+        map_file = map_file or scene_map_file(scene)
+        estimator = make_filter(description, load_map(map_file), load_estimator_settings(settings or description.name))
+    result = run_replay(_progress(samples_of(bag), "replaying", _bag_duration(bag)), estimator)
+    folder = new_run("replay", out)
+    summary = save_run(folder, result, kind="replay", seed=seed, configuration={
+        "robot": description, "bag": bag, "map": {"file": map_file}, "scene": scene, "estimator": estimator.settings})
+    _write_report(folder)
+    console.print(_run_table(summary))
+    console.print(f"report  {folder}/report.html")
+
+
+@app.command()
+def report(run: Annotated[Path, typer.Argument(help="run folder")] = Path("runs/latest"),
+           picture: Annotated[Path | None, typer.Option(help="also draw a still (PNG) and a moving picture (GIF): "
+                                                        "their path without the ending")] = None) -> None:
+    """Make the report of a run anew, from the files in its folder.
+
+    Example: `continuum-loc report runs/0003-replay --picture docs/localising`
+    """
+    path = _write_report(run)
+    console.print(f"report  {path}")
+    if picture is not None:
+        from continuum_loc.evaluation.pictures import draw
+
+        with _busy() as status:
+            status.update("drawing")
+            for made in draw(run, picture):
+                console.print(f"picture {made}")
+
+
+@app.command()
+def evaluate(name: Annotated[str | None, typer.Argument(help="study; without one they are listed")] = None,
+             quick: Annotated[bool, typer.Option("--quick", help="a small honest subset, under a minute")] = False,
+             out: Annotated[Path | None, typer.Option(help="folder of the results; default: a new run")] = None,
+             seed: Seed = 0, jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1) -> None:
+    """Run a study and compare its figures with their bounds; the exit code is 1 where one does not hold.
+
+    An interrupted study continues where it stopped when its `--out` is given again.
+
+    Example: `continuum-loc evaluate table2 --quick --jobs 2`
+    """
+    from continuum_loc.evaluation.runs import new_run
+    from continuum_loc.evaluation.study import load_study, study_names
+
+    if name is None:
+        console.print("studies: " + ", ".join(study_names()))
+        return
+    run = load_study(name)
+    out = out or new_run(name)
+    out.mkdir(parents=True, exist_ok=True)
+    claims = run(out, quick, seed, jobs)
+    console.print(_claims_table(claims))
+    console.print(f"results {out}")
+    raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+@app.command()
+def bench(quick: Annotated[bool, typer.Option("--quick", help="few repeats, small sizes")] = False,
+          out: Annotated[Path | None, typer.Option(help="folder of the results; default: a new run")] = None,
+          only: Annotated[str | None, typer.Option(help="one benchmark by name")] = None,
+          check: Annotated[bool, typer.Option("--check", help="compare with the committed baseline")] = False) -> None:
+    """Measure everything a user waits for beside what they would use instead, as ratios with spread.
+
+    Example: `continuum-loc bench --quick --only lookup`
+    """
+    from continuum_loc.evaluation.bench import run_bench
+    from continuum_loc.evaluation.runs import new_run
+
+    outcome = run_bench(out or new_run("bench"), quick, only, _each)
+    console.print(outcome.table)
+    for line in outcome.failures:
+        errors.print(f"[bold red]failed:[/] {line}", highlight=False)
+    regressions = outcome.regressions() if check else []
+    for line in regressions:
+        errors.print(f"[bold red]slower than the baseline:[/] {line}", highlight=False)
+    raise typer.Exit(FAILED if outcome.failures or regressions else OK)
+
+
+@map_app.command("build")
+def map_build(scene: Annotated[str, typer.Argument(help="scene name or mesh file")],
+              out: Annotated[Path, typer.Argument(help="file to write: .npz .ply .csv .xyz")],
+              points: Annotated[int, typer.Option(help="about how many points", min=100)] = 300_000,
+              spacing: Annotated[float | None, typer.Option(help="distance of the points [m]; instead of --points")]
+              = None, seed: Seed = 0) -> None:
+    """Sample a prior map from a scene or from your own mesh.
+
+    Example: `continuum-loc map build my_engine.stl my_map.npz --spacing 0.005`
+    """
+    from continuum_loc.mapping.build import sample_mesh
+    from continuum_loc.simulator.scenes import load_scene
+
+    with _busy() as status:
+        status.update("sampling the surface")
+        mesh = load_scene(scene)
+        density = {"count": points} if spacing is None else {"spacing": spacing}
+        prior = sample_mesh(mesh.vertices, mesh.faces, **density, seed=seed, source=scene)
+        prior.save(out)
+    _describe_map(out, prior)
+
+
+@map_app.command("convert")
+def map_convert(source: Annotated[Path, typer.Argument(help="cloud or mesh to read")],
+                out: Annotated[Path, typer.Argument(help="file to write: .npz .ply .csv .xyz")],
+                viewpoint: Annotated[tuple[float, float, float] | None, typer.Option(help="a place that the surface "
+                                     "is seen from, for clouds without normals")] = None) -> None:
+    """Read a map in any known form and write it in another.
+
+    Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1`
+    """
+    from continuum_loc.mapping.prior_map import load_map
+
+    prior = load_map(source, viewpoint=viewpoint)
+    prior.save(out)
+    _describe_map(out, prior)
+
+
+@map_app.command("info")
+def map_info(file: Annotated[Path, typer.Argument(help="map file")]) -> None:
+    """Say what a map holds.
+
+    Example: `continuum-loc map info map.npz`
+    """
+    from continuum_loc.mapping.prior_map import load_map
+
+    _describe_map(file, load_map(file))
+
+
+def _describe_map(path: Path, prior: Any) -> None:
+    low, high = prior.points.min(axis=0), prior.points.max(axis=0)
+    box = " x ".join(f"{a:.2f}..{b:.2f}" for a, b in zip(low, high, strict=True))
+    console.print(f"{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, mean planarity "
+                  f"{prior.planarity.mean():.2f}, normals {'outward' if prior.oriented else 'of either sign'}",
+                  highlight=False)
+
+
+def _write_report(folder: Path) -> Path:
+    from continuum_loc.evaluation.report import context_of, write_report
+    from continuum_loc.evaluation.runs import load_run
+
+    with _busy() as status:
+        status.update("writing the report")
+        run = load_run(folder)
+        return write_report(run, context_of(run))
+
+
+def _run_table(summary: dict[str, Any]) -> Any:
+    """The short table at the end of a run: one line per ring, then speed."""
+    from rich.table import Table
+
+    def cells(entry: dict[str, Any]) -> list[str]:
+        return [_figure(entry["translation_mae_m"], 100), _figure(entry["translation_rmse_m"], 100),
+                _figure(entry["rotation_mae_deg"]), _figure(entry["rotation_rmse_deg"]),
+                _figure(entry["nees_per_dof"]), _figure(entry["coverage_95"], 100)]
+
+    table = Table(caption=_speed(summary), caption_justify="left", show_edge=False)
+    for name in ("", "MAE cm", "RMSE cm", "MAE deg", "RMSE deg", "NEES/dof", "in 95 %, %"):
+        table.add_column(name, justify="right" if name else "left")
+    for ring, entry in summary["rings"].items():
+        table.add_row(ring, *cells(entry))
+    table.add_section()
+    table.add_row("all rings", *cells(summary), style="bold")
+    return table
+
+
+def _speed(summary: dict[str, Any]) -> str:
+    said = [f"real-time factor {_figure(summary['real_time_factor'])}",
+            f"step p99 {_figure(summary['step_ms']['p99'])} ms"]
+    if "latency_ms" in summary:
+        said.append(f"live latency p95 {_figure(summary['latency_ms']['p95'])} ms")
+    return ", ".join(said)
+
+
+def _claims_table(claims: list[Claim]) -> Any:
+    from rich.table import Table
+
+    table = Table(show_edge=False)
+    for name, justify in (("claim", "left"), ("value", "right"), ("unit", "left"), ("bound", "left"), ("", "left")):
+        table.add_column(name, justify=justify)
+    for claim in claims:
+        verdict = "[green]holds[/]" if claim.holds else "[bold red]FAILS[/]"
+        table.add_row(claim.name, f"{claim.value:.4g}", claim.unit, claim.bound, verdict)
+    return table
+
+
+def _count_table(counts: dict[str, int], title: str) -> None:
+    from rich.table import Table
+
+    table = Table("topic", "messages", title=title, title_justify="left", show_edge=False)
+    for topic, count in sorted(counts.items()):
+        table.add_row(topic, f"{count:,}")
+    console.print(table)
+
+
+def _figure(value: float | None, scale: float = 1.0) -> str:
+    return "-" if value is None else f"{scale * value:.2f}"
+
+
+def _busy() -> Any:
+    """A spinner whose text says what is going on."""
+    return errors.status("")
+
+
+def _progress(samples: Any, label: str, seconds: float | None) -> Any:
+    """Pass samples on, with a bar over the time that their stamps span."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.1f} s"),
+               TimeRemainingColumn())
+    with Progress(*columns, console=errors, transient=True) as progress:
+        task, first, shown = progress.add_task(label, total=seconds), None, 0.0
+        for sample in samples:
+            first = sample.stamp if first is None else first
+            elapsed = (sample.stamp - first) * 1e-9
+            if elapsed - shown > 0.1:
+                shown = elapsed
+                progress.update(task, completed=shown)
+            yield sample
+
+
+def _each(items: list[Any], label: str) -> Any:
+    """Pass items on, with a bar over their number."""
+    from rich.progress import track
+
+    return track(items, label, console=errors, transient=True)
+
+
+def _bag_duration(bag: Path) -> float | None:
+    from msg_tools.bag import open_bag
+
+    with open_bag(bag) as reader:
+        return reader.duration * 1e-9
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""One trial: a robot simulated in a scene, a prior map, and the filter over the samples. Studies, tests and the
+command line all build their trials here."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from continuum_loc.evaluation.replay import Filter, ReplayResult, replay
+from continuum_loc.measurements import Measurement, TrackedPose, TruthSample
+from continuum_loc.robot import RobotDescription, load_robot
+
+if TYPE_CHECKING:
+    from continuum_loc.estimator.settings import EstimatorSettings
+    from continuum_loc.mapping.prior_map import PriorMap
+    from continuum_loc.simulator.world import World
+
+MAP_POINTS = 300_000
+
+TOPICS = {"TofFrame": "tof/points", "ImuSample": "imu/data_raw", "FieldSample": "imu/mag", "StrainSample": "strain",
+          "EncoderSample": "joint_states", "TruthSample": "ground_truth/poses"}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What decides a simulated trial.
+
+    robot: a bundled name or a YAML file. scene, map_scene: scene names or mesh files; the prior map is that of
+    `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity: `paper` or `vl53l5cx`.
+    duration: seconds; None for the trajectory's own.
+    """
+
+    robot: str = "engine"
+    scene: str = "S0"
+    trajectory: str = "t1"
+    map_scene: str | None = None
+    profile: str = "live"
+    fidelity: str = "paper"
+    seed: int = 0
+    duration: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Short and unique among the trials of one study."""
+        return f"{self.map_scene or self.scene}-{self.scene}-{self.trajectory}-{self.fidelity}-{self.seed}"
+
+
+def world(trial: Trial, faults: tuple = ()) -> World:
+    """The simulated world of a trial, at rest."""
+    from continuum_loc.simulator.scenes import load_scene
+    from continuum_loc.simulator.world import World
+
+    robot = load_robot(trial.robot)
+    return World(robot, load_scene(trial.scene) if robot.tof else None, trial.trajectory, profile=trial.profile,
+                 tof_fidelity=trial.fidelity, seed=trial.seed, faults=faults)
+
+
+def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSample]:
+    """The samples of a trial, truth among them, in the order of their stamps."""
+    return world(trial, faults).run(trial.duration)
+
+
+def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
+    """Simulate and estimate, both in this thread; only the estimator is timed."""
+    robot = load_robot(trial.robot)
+    return replay(simulate(trial), make_filter(robot, scene_map(trial.map_scene or trial.scene), settings))
+
+
+def make_filter(robot: RobotDescription, prior_map: PriorMap | None,
+                settings: EstimatorSettings | None = None) -> Filter:
+    """The sliding-window filter, by default with the settings that come with the robot."""
+    from continuum_loc.estimator import SlidingWindowFilter, load_estimator_settings
+
+    return SlidingWindowFilter(robot, prior_map, settings or load_estimator_settings(robot.name))
+
+
+def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:
+    """The prior map of a scene, sampled from its mesh once and kept on disk."""
+    from continuum_loc.mapping.prior_map import load_map
+
+    return load_map(scene_map_file(scene_name, points, seed))
+
+
+def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> Path:
+    """The file of `scene_map`. Its name holds a digest of the mesh, so that a changed scene has a new map."""
+    from continuum_loc.mapping.build import sample_mesh
+    from continuum_loc.simulator.scenes import load_scene
+
+    scene = load_scene(scene_name)
+    digest = hashlib.sha256(scene.vertices.tobytes() + scene.faces.tobytes()).hexdigest()[:16]
+    path = map_cache() / f"{Path(scene_name).stem}-{points}-{seed}-{digest}.npz"
+    if not path.is_file():
+        prior = sample_mesh(scene.vertices, scene.faces, count=points, seed=seed, source=str(scene_name))
+        partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
+        prior.save(partial)
+        partial.replace(path)  # atomic: another process sees all of it or nothing
+    return path
+
+
+def map_cache() -> Path:
+    """`$XDG_CACHE_HOME/continuum_loc/maps`, by default under `~/.cache`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "continuum_loc" / "maps"
+
+
+def topic_of(sample: Measurement | TruthSample) -> str:
+    """The topic of the contract that carries this sample."""
+    return f"tracker/{sample.sensor}" if isinstance(sample, TrackedPose) else TOPICS[type(sample).__name__]
+
+
+def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[str, int]:
+    """Record samples into a new bag folder; how many of each topic."""
+    from msg_tools.bag import BagWriter
+
+    counts: dict[str, int] = {}
+    with BagWriter(path) as bag:
+        for sample in samples:
+            topic = topic_of(sample)
+            bag.write(topic, sample)
+            counts[topic] = counts.get(topic, 0) + 1
+    return counts
+
+
+def configuration(trial: Trial, estimator: Filter | None = None, **more: Any) -> dict[str, Any]:
+    """Everything that a trial was made from, for its run folder."""
+    resolved = {"robot": load_robot(trial.robot), "scene": trial.scene, "trajectory": trial.trajectory,
+                "map": {"scene": trial.map_scene or trial.scene, "points": MAP_POINTS}, "profile": trial.profile,
+                "tof_fidelity": trial.fidelity, "seed": trial.seed, "duration": trial.duration}
+    if estimator is not None:
+        resolved["estimator"] = estimator.settings
+    return {**resolved, **more}
