@@ -23,18 +23,20 @@ if TYPE_CHECKING:
 GRAVITY = 9.81
 ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
 NODE_PREFIX = "node"
+GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
 
 
 def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
-               gravity: float = GRAVITY) -> mujoco.MjSpec:
-    """The model before compilation. `scene` gives the convex pieces to collide with, None the empty space."""
+               supported: bool = False) -> mujoco.MjSpec:
+    """The model before compilation. `scene` gives the convex pieces to collide with, None the empty space;
+    `supported` lets something else carry the rod's weight."""
     import mujoco
 
     chosen = plant.profile(profile)
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.option.timestep = chosen.time_step
-    spec.option.gravity = (0.0, 0.0, -gravity)
+    spec.option.gravity = (0.0, 0.0, 0.0 if supported else -GRAVITY)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.solver = mujoco.mjtSolver.mjSOL_CG
     spec.compiler.autolimits = True
@@ -48,9 +50,9 @@ def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profil
 
 
 def build_model(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
-                gravity: float = GRAVITY) -> mujoco.MjModel:
+                supported: bool = False) -> mujoco.MjModel:
     """Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip."""
-    return build_spec(robot, plant, scene, profile, gravity).compile()
+    return build_spec(robot, plant, scene, profile, supported).compile()
 
 
 def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> None:
@@ -119,19 +121,27 @@ def _add_link(body, robot: RobotDescription, plant: PlantSettings, back: float, 
 
 
 def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
-    """Each tendon threads a site on every link up to its module's end; its actuator pulls with ctrl newtons."""
+    """Each tendon threads a channel in every link up to its module's end; its actuator pulls with ctrl newtons.
+
+    A channel opens at GUIDE / 2 of a segment from each joint. Its straight stretch across the joint has the moment
+    arm r cos(phi / 2) + GUIDE h / 2 sin(phi / 2): short stretches keep the second term, which a rod that is guided
+    all along does not have, small.
+    """
     import mujoco
 
     names = iter(plant.tendon_names)
+    reach = (1.0 - GUIDE) / 2.0 * np.diff(nodes)  # from a node to the channel's mouth, in each segment
+    openings = [mouth for i, x in enumerate(reach) for mouth in ((i, x), (i + 1, -x))]
     for group in plant.tendons:
         last = int(np.argmin(np.abs(nodes - group.end)))
         for azimuth in np.radians(group.azimuth_deg):
             name = next(names)
-            offset = (0.0, group.radius * np.cos(azimuth), group.radius * np.sin(azimuth))
+            offset = (group.radius * np.cos(azimuth), group.radius * np.sin(azimuth))
             tendon = spec.add_tendon(name=name, frictionloss=group.friction)
-            for i in range(last + 1):
-                spec.body(f"{NODE_PREFIX}{i}").add_site(name=f"{name}_{i}", pos=offset, group=4)
-                tendon.wrap_site(f"{name}_{i}")
+            for i, x in openings[:2 * last]:
+                site = f"{name}_{i}{'b' if x < 0 else 'f'}"
+                spec.body(f"{NODE_PREFIX}{i}").add_site(name=site, pos=(x, *offset), group=4)
+                tendon.wrap_site(site)
             pull = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_TENDON, target=name,
                                      ctrllimited=True, ctrlrange=(0.0, group.max_force))
             pull.set_to_motor()

@@ -1,16 +1,16 @@
 """Named trajectories: tendon tensions and insertion as smooth functions of time.
 
 Each begins with one second at rest (the settled shape under the first row's tensions), which the estimator may
-use to average gyro biases; its first keyframe ends that rest. Between keyframes a cubic spline keeps tensions and
-their rates continuous.
+use to average gyro biases; its first keyframe ends that rest. Between keyframes a monotone cubic keeps values and
+rates continuous and never overshoots a keyframe: no tension is commanded that the table does not show.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import PchipInterpolator
 
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import SettingsError
@@ -31,19 +31,27 @@ class Command:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; held before the first and after the last."""
+    """Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; held before the first and after the last.
+
+    supported: the arm lies in a groove that carries its weight.
+    """
 
     name: str
     times: np.ndarray
     tensions: np.ndarray
     insertion: np.ndarray
-    _spline: CubicSpline = field(init=False, repr=False)
+    supported: bool = False
+    _spline: PchipInterpolator = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         values = np.column_stack([self.tensions, self.insertion])
+        if self.tensions.min() < 0.0:
+            raise ValueError(f"trajectory '{self.name}': tendons only pull, got {self.tensions.min()} N")
         if len(self.times) < 2 or np.any(np.diff(self.times) <= 0.0) or not np.all(np.isfinite(values)):
             raise ValueError(f"trajectory '{self.name}': needs two or more finite keyframes at increasing times")
-        object.__setattr__(self, "_spline", CubicSpline(self.times, values, bc_type="clamped"))
+        # One more second of the end values on either side: the motion starts and ends with zero rate.
+        times = np.concatenate([[self.times[0] - 1.0], self.times, [self.times[-1] + 1.0]])
+        object.__setattr__(self, "_spline", PchipInterpolator(times, values[[0, *range(len(values)), -1]]))
 
     @property
     def duration(self) -> float:
@@ -51,10 +59,10 @@ class Trajectory:
         return float(self.times[-1])
 
     def command(self, time: float) -> Command:
-        """The command at `time` [s]; tensions never below zero."""
+        """The command at `time` [s]."""
         t = min(max(time, self.times[0]), self.times[-1])
         value, rate = self._spline(t), self._spline(t, 1)
-        return Command(np.maximum(value[:-1], 0.0), float(value[-1]), float(rate[-1]) if t == time else 0.0)
+        return Command(value[:-1], float(value[-1]), float(rate[-1]))
 
 
 # Keyframes of the engine robot: time [s], insertion [m], then for each module the curvature wanted about body y
@@ -145,7 +153,62 @@ def _varied(base: Trajectory, rng: np.random.Generator) -> Trajectory:
     moving = base.times > REST
     scale = 1.0 + 0.05 * rng.standard_normal((len(base.times), 1)) * moving[:, None]
     insertion = np.clip(base.insertion * (1.0 + 0.03 * rng.standard_normal(len(base.times)) * moving), 0.0, None)
-    return Trajectory(base.name, base.times, base.tensions * scale, insertion)
+    return replace(base, tensions=base.tensions * scale, insertion=insertion)
 
 
-TRAJECTORIES = {"engine": {name: _engine for name in _ENGINE}}
+# Keyframes of the soft arm: time [s], tension of the central tendon and of the three distal ones [N].
+_BOX = {
+    "b1": [  # slow, once round
+        (1.0, 2, 3, 3, 3), (4.0, 2, 12, 3, 3), (7.0, 2, 8, 10, 2), (10.0, 4, 2, 12, 4), (13.0, 4, 2, 8, 10),
+        (16.0, 2, 4, 2, 12), (18.5, 2, 9, 2, 6), (20.0, 2, 6, 3, 3)],
+    "b2": [  # the central tendon against the distal ones: S-shapes
+        (1.0, 3, 3, 3, 3), (3.5, 14, 2, 6, 2), (6.0, 14, 3, 3, 12), (9.0, 3, 10, 2, 2), (11.5, 10, 2, 2, 14),
+        (14.0, 16, 2, 2, 10), (17.0, 4, 3, 12, 3), (20.0, 3, 4, 4, 4)],
+    "b3": [  # brisk: within a second from side to side
+        (1.0, 2, 4, 4, 4), (2.2, 2, 14, 3, 3), (3.4, 2, 3, 12, 3), (4.6, 2, 3, 3, 14), (6.0, 8, 3, 3, 4),
+        (7.2, 3, 12, 10, 2), (8.4, 3, 2, 3, 12), (10.0, 3, 2, 3, 12), (11.2, 2, 14, 4, 2), (12.4, 10, 2, 12, 2),
+        (14.0, 2, 2, 2, 2), (15.2, 2, 10, 2, 10), (16.4, 2, 2, 14, 4), (18.0, 4, 6, 6, 6), (20.0, 2, 4, 4, 4)],
+    "b4": [  # up and down: all tendons together, then released
+        (1.0, 2, 3, 3, 3), (4.0, 5, 12, 12, 12), (6.5, 5, 16, 10, 12), (9.0, 2, 3, 3, 3), (11.5, 8, 8, 14, 12),
+        (14.0, 12, 10, 12, 16), (16.5, 4, 4, 3, 8), (18.5, 2, 10, 4, 4), (20.0, 2, 3, 3, 3)],
+    "b5": [  # wide, to the walls and what stands on the floor
+        (1.0, 2, 3, 3, 3), (4.0, 6, 18, 2, 4), (6.5, 10, 16, 8, 2), (9.0, 6, 4, 18, 2), (11.5, 2, 2, 16, 8),
+        (14.0, 2, 2, 5, 20), (16.5, 6, 8, 2, 16), (18.5, 4, 8, 3, 6), (20.0, 2, 4, 3, 3)],
+}
+
+# The paper's grooves: curvature of the template [1/m], straight and arcs of 160 and 80 mm in diameter.
+_GROOVES = {"straight": 0.0, "groove160": 1.0 / 0.08, "groove80": 1.0 / 0.04}
+
+# Keyframes of the Hall arm in free bending: time [s], curvature about body y and z [1/m].
+_FREE = {
+    "free1": [(1.0, 0, 0), (3.0, 8, 0), (5.0, 0, 10), (7.0, -10, 4), (9.0, -4, -10), (11.0, 10, -6), (14.0, 14, 6),
+              (16.0, 0, 16), (18.0, -8, 4), (20.0, 0, 0)],
+    "free2": [(1.0, 0, 0), (1.8, 10, 3), (2.6, -6, 8), (3.6, -12, -4), (4.6, 6, -10), (5.6, 6, 10), (7.0, 0, 0),
+              (8.0, 14, 0), (9.0, -14, 0), (10.0, 0, 0)],
+}
+
+
+def _box(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+    rows = np.array(_BOX[name], float)
+    return Trajectory(name, rows[:, 0], rows[:, 1:], np.zeros(len(rows)))
+
+
+def _free(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+    rows = np.array(_FREE[name], float)
+    tensions = plant.tension_for_moments(plant.EI * rows[:, None, 1:])
+    return Trajectory(name, rows[:, 0], tensions, np.zeros(len(rows)))
+
+
+def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+    """From straight into the groove within three seconds, then still. Uniform moment bends a uniform rod to an arc."""
+    curvature = _GROOVES[name] * np.array([0.0, 1.0, 1.0])
+    moments = plant.EI * np.stack([curvature, np.zeros(3)], axis=-1)[:, None, :]
+    times = np.array([REST, REST + 3.0, REST + 9.0])
+    return Trajectory(name, times, plant.tension_for_moments(moments), np.zeros(3), supported=True)
+
+
+TRAJECTORIES = {
+    "engine": dict.fromkeys(_ENGINE, _engine),
+    "soft_arm": dict.fromkeys(_BOX, _box),
+    "hall_arm": dict.fromkeys(_GROOVES, _groove) | dict.fromkeys(_FREE, _free),
+}

@@ -67,7 +67,8 @@ class World:
         self.trajectory = _resolve(trajectory, robot, self.plant)
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
         self.tof_fidelity = tof_fidelity
-        self.body = _Body(robot, self.plant, build_model(robot, self.plant, scene, profile), self.trajectory)
+        model = build_model(robot, self.plant, scene, profile, self.trajectory.supported)
+        self.body = _Body(robot, self.plant, model, self.trajectory)
         self.motion = Motion()
 
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
