@@ -230,7 +230,7 @@ def _hub_hulls(stations: np.ndarray) -> Hulls:
 
 
 # Borescope ports, blind holes in the casing: x, azimuth [deg], radius.
-_PORTS = ((0.50, -4.0, 0.030), (0.86, 10.0, 0.035), (1.30, -16.0, 0.040), (1.76, 12.0, 0.030), (0.05, 6.0, 0.025))
+_PORTS = ((0.50, -4.0, 0.030), (0.86, 10.0, 0.035), (1.30, -16.0, 0.040), (1.755, 12.0, 0.030), (0.05, 6.0, 0.025))
 # Bosses on the casing: x, azimuth [deg], radius, height.
 _BOSSES = (
     (0.30, -12.0, 0.050, 0.05),

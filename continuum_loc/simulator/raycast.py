@@ -35,72 +35,96 @@ class RayCaster:
         normals = np.where(missed[:, None], np.nan, self.scene.face_normals[faces])
         return hits["t_hit"].numpy().astype(float), faces, normals
 
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (N,) from points (N, 3) to the nearest surface [m], negative inside solid matter."""
+        return self._embree.compute_signed_distance(self._tensor(np.asarray(points, np.float32))).numpy().astype(float)
+
 
 @njit(cache=True)
 def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndarray) -> np.ndarray:
-    """Distance (N,) along unit rays to the first of M capsules, inf where none is hit.
+    """Distance (S, K) along the K unit rays of S fans to the first of M capsules, inf where none is hit.
 
-    Each capsule (M, 7) is ax ay az bx by bz radius: all points within `radius` of the segment from a to b.
-    Only entering hits count: a sensor inside a capsule (its own mount) looks through that capsule.
+    origins: (S, 3). directions: (S, K, 3). Each capsule (M, 7) is ax ay az bx by bz radius: all points within
+    `radius` of the segment from a to b. A fan that starts inside a capsule (its own mount) looks through it.
     """
-    nearest = np.full(len(origins), np.inf)
-    for j in range(len(capsules)):
-        a, b, radius = capsules[j, 0:3], capsules[j, 3:6], capsules[j, 6]
-        centre = 0.5 * (a + b)
-        reach = 0.5 * np.sqrt(np.sum((b - a) ** 2)) + radius
-        for i in range(len(origins)):
-            if _misses_ball(origins[i], directions[i], centre, reach, nearest[i]):
+    fans, rays = directions.shape[:2]
+    nearest = np.full((fans, rays), np.inf)
+    for i in range(fans):
+        cone_axis, half_angle = _enclosing_cone(directions[i])
+        for j in range(len(capsules)):
+            axis, offset, radius = capsules[j, 3:6] - capsules[j, 0:3], origins[i] - capsules[j, 0:3], capsules[j, 6]
+            if _outside_cone(cone_axis, half_angle, axis, offset, radius):
                 continue
-            nearest[i] = min(nearest[i], _capsule_entry(origins[i], directions[i], a, b, radius))
+            axis_axis, axis_offset, offset_offset = _dot(axis, axis), _dot(axis, offset), _dot(offset, offset)
+            if _inside(axis_axis, axis_offset, offset_offset, radius):
+                continue
+            for k in range(rays):
+                entry = _capsule_entry(axis_axis, axis_offset, offset_offset, _dot(axis, directions[i, k]),
+                                       _dot(offset, directions[i, k]), radius)
+                nearest[i, k] = min(nearest[i, k], entry)
     return nearest
 
 
-@njit(cache=True, inline="always")
-def _misses_ball(origin, direction, centre, reach, limit):
-    """True where a ray cannot meet the ball before `limit`: sifts out nearly all pairs cheaply."""
-    x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
-    along = x * direction[0] + y * direction[1] + z * direction[2]
-    squared = x * x + y * y + z * z
-    return squared - along * along > reach * reach or along < -reach or along - reach > limit
+@njit(cache=True)
+def _enclosing_cone(directions):
+    """Axis (3,) and half angle of a cone round a fan's rays."""
+    axis = np.zeros(3)
+    for k in range(len(directions)):
+        axis += directions[k]
+    axis /= max(np.sqrt(_dot(axis, axis)), 1e-12)
+    cosine = 1.0
+    for k in range(len(directions)):
+        cosine = min(cosine, _dot(axis, directions[k]))
+    return axis, np.arccos(max(-1.0, cosine))
 
 
 @njit(cache=True)
-def _capsule_entry(origin, direction, a, b, radius):
-    """Distance at which a ray enters a capsule, inf if it does not (or starts inside)."""
-    axis, offset = b - a, origin - a
-    axis_axis, axis_direction, axis_offset = np.dot(axis, axis), np.dot(axis, direction), np.dot(axis, offset)
-    quadratic = axis_axis - axis_direction * axis_direction
-    if quadratic > 1e-12 * axis_axis:
-        linear = axis_axis * np.dot(direction, offset) - axis_offset * axis_direction
-        constant = axis_axis * (np.dot(offset, offset) - radius * radius) - axis_offset * axis_offset
-        discriminant = linear * linear - quadratic * constant
+def _outside_cone(cone_axis, half_angle, axis, offset, radius):
+    """True where a capsule's bounding ball is clear of the fan's cone: sifts out nearly all of the body at once."""
+    to_centre = 0.5 * axis - offset
+    reach = 0.5 * np.sqrt(_dot(axis, axis)) + radius
+    distance = np.sqrt(_dot(to_centre, to_centre))
+    if distance <= reach:
+        return False
+    angle = np.arccos(max(-1.0, min(1.0, _dot(cone_axis, to_centre) / distance)))
+    return angle > half_angle + np.arcsin(reach / distance)
+
+
+# A ray from o along unit d against a capsule from a along v needs only the products of v, w = o - a and d: below,
+# vv, vw, ww are those of the capsule and the origin, vd and wd those with the ray's direction.
+
+
+@njit(cache=True)
+def _capsule_entry(vv, vw, ww, vd, wd, radius):
+    """Distance at which a ray from outside enters a capsule, inf if it does not."""
+    quadratic = vv - vd * vd
+    if quadratic > 1e-12 * vv:
+        linear = vv * wd - vw * vd
+        discriminant = linear * linear - quadratic * (vv * (ww - radius * radius) - vw * vw)
         if discriminant < 0.0:
             return np.inf
         distance = (-linear - np.sqrt(discriminant)) / quadratic
-        station = axis_offset + distance * axis_direction
-        if 0.0 < station < axis_axis:
-            return distance if distance > 0.0 and not _inside(origin, a, b, radius) else np.inf
-    if _inside(origin, a, b, radius):
-        return np.inf
-    return min(_ball_entry(offset, direction, radius), _ball_entry(origin - b, direction, radius))
+        if 0.0 < vw + distance * vd < vv:
+            return distance if distance > 0.0 else np.inf
+    return min(_ball_entry(ww, wd, radius), _ball_entry(ww - 2.0 * vw + vv, wd - vd, radius))
 
 
 @njit(cache=True)
-def _ball_entry(offset, direction, radius):
-    along = np.dot(direction, offset)
-    discriminant = along * along - np.dot(offset, offset) + radius * radius
+def _ball_entry(ww, wd, radius):
+    discriminant = wd * wd - ww + radius * radius
     if discriminant < 0.0:
         return np.inf
-    distance = -along - np.sqrt(discriminant)
+    distance = -wd - np.sqrt(discriminant)
     return distance if distance > 0.0 else np.inf
 
 
 @njit(cache=True)
-def _inside(point, a, b, radius):
-    axis = b - a
-    squared = np.dot(axis, axis)
-    station = 0.0
-    if squared > 0.0:
-        station = min(max(np.dot(point - a, axis) / squared, 0.0), 1.0)
-    gap = point - a - station * axis
-    return np.dot(gap, gap) <= radius * radius
+def _inside(vv, vw, ww, radius):
+    """True where the origin lies within the capsule."""
+    station = min(max(vw / vv, 0.0), 1.0) if vv > 0.0 else 0.0
+    return ww - 2.0 * station * vw + station * station * vv <= radius * radius
+
+
+@njit(cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,12 +1,14 @@
 """Multizone time-of-flight sensors, cast against the scene and the robot's own body.
 
-`paper` (Sec. IV-C): one ray per zone, Gaussian noise of Table I along the measured distance, nothing else.
+Two fidelities: `paper` (Sec. IV-C), one ray per zone with Gaussian noise of Table I along the measured distance; and
+`vl53l5cx`, which also reproduces what the real sensor does (see `vl53l5cx.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
@@ -14,19 +16,46 @@ from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID, TofFrame
 from continuum_loc.robot import TofModel
 from continuum_loc.simulator.raycast import RayCaster, cast_capsules
 
+TOF_TOO_CLOSE = 4  # the driver reports a consistency failure there
+
 Fidelity = Literal["paper", "vl53l5cx"]
-TOF_INCONSISTENT = 4  # the driver's status for a target that it cannot make sense of
+
+# The body's black plastic, and the mean cosine at which rays meet a cylinder seen broadside.
+_BODY_REFLECTANCE = 0.3 * np.pi / 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Echoes:
+    """What K rays of S sensors meet: distance (S, K) along the ray [m], inf where nothing; and the share of light
+    that comes back (S, K), reflectance times cosine of incidence."""
+
+    distance: np.ndarray
+    brightness: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Per sensor and zone (S, Z), as in `TofFrame`: ranges [m], stated sigma [m], status."""
+
+    ranges: np.ndarray
+    sigma: np.ndarray
+    status: np.ndarray
+
+
+class Receiver(Protocol):
+    """Turns echoes into readings. `directions` (K, 3) are the rays that it needs, in the sensor frame."""
+
+    directions: np.ndarray
+
+    def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings: ...
 
 
 class TofSensorModel:
     """All ToF sensors of one robot. The same generator state and poses give the same frames."""
 
     def __init__(self, tof_model: TofModel, caster: RayCaster, fidelity: Fidelity, rng: np.random.Generator) -> None:
-        if fidelity not in ("paper", "vl53l5cx"):
-            raise ValueError(f"no ToF fidelity '{fidelity}': give paper or vl53l5cx")
-        self._model, self._caster, self._rng = tof_model, caster, rng
-        # The raw distance times this gives the range along the zone's central ray.
-        self._raw_per_range = tof_model.directions[:, 0] if tof_model.convention == "perpendicular" else 1.0
+        self._zones, self._caster, self._rng = tof_model.directions, caster, rng
+        self._receiver = _receiver(tof_model, fidelity)
 
     def measure(self, T_map_sensors: np.ndarray, names: Sequence[str], stamp: int,
                 body_capsules: np.ndarray | None = None) -> list[TofFrame]:
@@ -35,31 +64,57 @@ class TofSensorModel:
         T_map_sensors: (S, 4, 4) true sensor poses. names: S sensor names. stamp: ns. body_capsules: (M, 7), the
         robot's body as `cast_capsules` wants it; None leaves the body out of view.
         """
-        if len(T_map_sensors) != len(names):
-            raise ValueError(f"{len(T_map_sensors)} sensor poses but {len(names)} names")
-        ranges, status = self._measure_ranges(np.asarray(T_map_sensors, dtype=float), body_capsules)
-        sigma = np.where(np.isfinite(ranges), self._model.sigma(np.abs(ranges)), np.nan)
-        points = np.where(np.isfinite(ranges)[..., None], ranges[..., None] * self._model.directions, np.nan)
-        return [TofFrame(stamp, name, points[i], ranges[i], sigma[i], status[i]) for i, name in enumerate(names)]
+        if np.shape(T_map_sensors) != (len(names), 4, 4):
+            raise ValueError(f"sensor poses {np.shape(T_map_sensors)} do not fit {len(names)} names")
+        echoes = self._cast(np.asarray(T_map_sensors, dtype=float), body_capsules)
+        readings = self._receiver.read(echoes, names, self._rng)
+        finite = np.isfinite(readings.ranges)[..., None]
+        points = np.where(finite, readings.ranges[..., None] * self._zones, np.nan)
+        return [TofFrame(stamp, name, points[i], readings.ranges[i], readings.sigma[i], readings.status[i])
+                for i, name in enumerate(names)]
 
-    def _measure_ranges(self, T_map_sensors, body_capsules):
-        """Ranges and status (S, Z) in the `paper` fidelity."""
-        model = self._model
-        raw = self._cast(T_map_sensors, model.directions, body_capsules) * self._raw_per_range
-        noise = self._rng.standard_normal(raw.shape)  # drawn for every zone, hit or not: streams stay aligned
-        hit = raw <= model.max_range
-        raw = np.where(hit, raw + noise * model.sigma(np.where(hit, raw, 0.0)), np.inf)
-        too_close = raw < model.min_range
-        ranges = np.where(too_close, -np.inf, raw / self._raw_per_range)
-        status = np.select([too_close, ~hit], [TOF_INCONSISTENT, TOF_NO_TARGET], TOF_VALID).astype(np.uint8)
-        return ranges, status
-
-    def _cast(self, T_map_sensors: np.ndarray, directions: np.ndarray, body_capsules: np.ndarray | None) -> np.ndarray:
-        """True distances (S, K) along K sensor-frame unit directions of each sensor."""
-        rays = directions @ T_map_sensors[:, :3, :3].transpose(0, 2, 1)
-        origins = np.broadcast_to(T_map_sensors[:, None, :3, 3], rays.shape).reshape(-1, 3)
+    def _cast(self, T_map_sensors: np.ndarray, body_capsules: np.ndarray | None) -> Echoes:
+        rays = self._receiver.directions @ T_map_sensors[:, :3, :3].transpose(0, 2, 1)
+        origins = np.ascontiguousarray(T_map_sensors[:, :3, 3])
         flat = rays.reshape(-1, 3)
-        distance, _, _ = self._caster.cast(origins, flat)
-        if body_capsules is not None:
-            distance = np.minimum(distance, cast_capsules(origins, flat, body_capsules))
-        return distance.reshape(rays.shape[:2])
+        distance, face, normal = self._caster.cast(np.repeat(origins, rays.shape[1], axis=0), flat)
+        cosine = np.abs(np.einsum("ij,ij->i", normal, flat))
+        brightness = np.where(face >= 0, self._caster.scene.reflectance[face] * cosine, 0.0)
+        distance, brightness = distance.reshape(rays.shape[:2]), brightness.reshape(rays.shape[:2])
+        if body_capsules is None:
+            return Echoes(distance, brightness)
+        body = cast_capsules(origins, np.ascontiguousarray(rays), np.ascontiguousarray(body_capsules, dtype=float))
+        hidden = body < distance
+        return Echoes(np.where(hidden, body, distance), np.where(hidden, _BODY_REFLECTANCE, brightness))
+
+
+class PaperReceiver:
+    """One ray per zone. Noise: N(0, sigma(d)) of Table I on the raw distance d, along the ray or along the optical
+    axis as the model's convention has it."""
+
+    def __init__(self, tof_model: TofModel) -> None:
+        self.directions = tof_model.directions
+        self._model = tof_model
+        self._raw_per_range = self.directions[:, 0] if tof_model.convention == "perpendicular" else 1.0
+
+    def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings:
+        """Readings (S, Z) of echoes (S, Z)."""
+        model, raw = self._model, echoes.distance * self._raw_per_range
+        noise = rng.standard_normal(raw.shape)  # for every zone, hit or not: the stream stays aligned
+        hit = raw <= model.max_range
+        measured = np.where(hit, raw, 0.0) + noise * model.sigma(np.where(hit, raw, 0.0))
+        too_close = hit & (measured < model.min_range)
+        ranges = np.select([~hit, too_close], [np.inf, -np.inf], measured / self._raw_per_range)
+        sigma = np.where(np.isfinite(ranges), model.sigma(measured) / self._raw_per_range, np.nan)
+        status = np.select([~hit, too_close], [TOF_NO_TARGET, TOF_TOO_CLOSE], TOF_VALID).astype(np.uint8)
+        return Readings(ranges, sigma, status)
+
+
+def _receiver(tof_model: TofModel, fidelity: str) -> Receiver:
+    if fidelity == "paper":
+        return PaperReceiver(tof_model)
+    if fidelity == "vl53l5cx":
+        from continuum_loc.simulator.vl53l5cx import Vl53l5cxReceiver
+
+        return Vl53l5cxReceiver(tof_model)
+    raise ValueError(f"no ToF fidelity '{fidelity}': give {' or '.join(get_args(Fidelity))}")
