@@ -23,7 +23,16 @@ if TYPE_CHECKING:
 GRAVITY = 9.81
 ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
 NODE_PREFIX = "node"
+REST_SPEED = 1e-4
+SETTLE_LIMIT = 60.0  # s of simulated time
+SETTLE_DAMPING = 8.0  # damping while settling, relative to the plant's: near critical for the first mode
+QUIET_STEPS = 20
+DIVERGED_SPEED = 1e3  # rad/s or m/s
 GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
+
+
+class SimulationDiverged(RuntimeError):
+    """The simulation cannot go on; the message says when, where and what to change."""
 
 
 def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
@@ -39,6 +48,7 @@ def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profil
     spec.option.gravity = (0.0, 0.0, 0.0 if supported else -GRAVITY)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.solver = mujoco.mjtSolver.mjSOL_CG
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # divergence is ours to report
     spec.compiler.autolimits = True
     nodes = node_arclengths(robot, plant, chosen.link_length)
     _check_step(plant, nodes, chosen.time_step)
@@ -53,6 +63,42 @@ def build_model(robot: RobotDescription, plant: PlantSettings, scene=None, profi
                 supported: bool = False) -> mujoco.MjModel:
     """Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip."""
     return build_spec(robot, plant, scene, profile, supported).compile()
+
+
+def advance(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """One step. Raises SimulationDiverged, with the joint and what to change."""
+    import mujoco
+
+    mujoco.mj_step(model, data)
+    speed = np.abs(data.qvel)
+    if np.isfinite(data.qacc).all() and speed.max(initial=0.0) < DIVERGED_SPEED:
+        return
+    worst = int(np.argmax(np.where(np.isfinite(data.qacc), speed, np.inf)))
+    joint = model.joint(int(model.dof_jntid[worst])).name
+    raise SimulationDiverged(
+        f"the simulation diverged at {data.time:.4f} s in joint '{joint}' ({speed[worst]:.3g} rad/s or m/s): shorten "
+        f"`time_step` (now {model.opt.timestep} s) or raise `relaxation` in the plant, or lower the forces there")
+
+
+def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_SPEED) -> None:
+    """Bring the model to rest under its present controls and applied forces; velocities end at zero.
+
+    rest_speed: what every link has to be slower than, m/s and rad/s. Raises SimulationDiverged.
+    """
+    damping = model.dof_damping.copy()
+    model.dof_damping[:] = SETTLE_DAMPING * damping
+    try:
+        quiet = 0
+        while quiet < QUIET_STEPS:
+            if data.time > SETTLE_LIMIT:
+                raise SimulationDiverged(
+                    f"the robot did not come to rest within {SETTLE_LIMIT} s under its first tensions: raise "
+                    "`relaxation` in the plant, or begin the trajectory without contact")
+            advance(model, data)
+            quiet = quiet + 1 if np.abs(data.cvel).max() < rest_speed else 0
+    finally:
+        model.dof_damping[:] = damping
+    data.qvel[:] = 0.0
 
 
 def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> None:

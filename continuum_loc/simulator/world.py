@@ -21,7 +21,7 @@ from continuum_loc.measurements import NANOSECONDS, Measurement, TruthSample
 from continuum_loc.robot import RobotDescription, Sensor
 from continuum_loc.settings import SettingsError
 from continuum_loc.simulator import sensors as models
-from continuum_loc.simulator.model import GRAVITY, NODE_PREFIX, build_model, carriage_damping
+from continuum_loc.simulator.model import GRAVITY, NODE_PREFIX, advance, build_model, carriage_damping, settle
 from continuum_loc.simulator.motion import Motion, State, backbone, segment_strain
 from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclengths
 from continuum_loc.simulator.trajectories import Trajectory, trajectory
@@ -33,13 +33,6 @@ TRUTH_RATE = 100.0
 ENCODER_RATE = 50.0
 ENCODER_SIGMA = 1e-4  # m, tendon displacement
 DEFAULT_START = NANOSECONDS
-REST_SPEED = 1e-4  # m/s: slower than this everywhere counts as settled
-SETTLE_LIMIT = 60.0  # s of simulated time
-SETTLE_DAMPING = 8.0  # damping while settling, relative to the plant's: near critical for the first mode
-
-
-class SimulationDiverged(RuntimeError):
-    """The simulation cannot go on; the message says when, where and what to change."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +67,7 @@ class World:
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
         """Samples of the first `duration` seconds (default: the trajectory's), in the order of their stamps.
 
-        Every call starts again from rest. Raises SimulationDiverged.
+        Every call starts again from rest. Raises model.SimulationDiverged.
         """
         stream = self._run(self.trajectory.duration if duration is None else duration)
         for fault in self.faults:
@@ -193,10 +186,9 @@ class _Body:
         self._nodes = np.array([i for i in range(model.nbody) if model.body(i).name.startswith(NODE_PREFIX)])
         self._slides = robot.base.insertion.mode != "fixed"
         self._lead = carriage_damping(plant) / plant.carriage_stiffness  # s: cancels the drag of the drive's damping
-        self._damping = model.dof_damping.copy()
         mujoco.mj_forward(model, self.data)
         self.straight_length = self.data.ten_length.copy()
-        self._pending_step = 0
+        self._steps = 0
 
     def settle(self) -> None:
         """Bring the robot to rest under the first command, from straight; time 0 is then the trajectory's start."""
@@ -205,17 +197,8 @@ class _Body:
         self._command(0.0)
         if self._slides:
             data.qpos[0] = data.ctrl[0]
-        model.dof_damping[:] = SETTLE_DAMPING * self._damping
-        quiet = 0
-        while quiet < 20:
-            if data.time > SETTLE_LIMIT:
-                raise SimulationDiverged(f"the robot did not come to rest within {SETTLE_LIMIT} s under the "
-                                         "trajectory's first tensions: raise `relaxation` in the plant, or begin "
-                                         "the trajectory without contact")
-            self._advance()
-            quiet = quiet + 1 if self._speed() < REST_SPEED else 0
-        model.dof_damping[:] = self._damping
-        data.time, data.qvel[:] = 0.0, 0.0
+        settle(model, data)
+        data.time = 0.0
         self._steps = 0
 
     def resting_states(self) -> list[State]:
@@ -231,7 +214,7 @@ class _Body:
         """
         time = self._steps * self.model.opt.timestep
         self._command(time)
-        self._advance()
+        advance(self.model, self.data)
         self._steps += 1
         return self._state(time)
 
@@ -239,21 +222,6 @@ class _Body:
         command = self.path.command(time)
         drive = [command.insertion + self._lead * command.insertion_rate] if self._slides else []
         self.data.ctrl[:] = np.append(drive, command.tension)
-
-    def _advance(self) -> None:
-        self._mujoco.mj_step(self.model, self.data)
-        if not np.all(np.isfinite(self.data.qacc)) or np.abs(self.data.qvel).max(initial=0.0) > 1e3:
-            raise SimulationDiverged(self._diagnosis())
-
-    def _diagnosis(self) -> str:
-        worst = int(np.argmax(np.nan_to_num(np.abs(self.data.qvel), nan=np.inf)))
-        joint = self.model.joint(int(self.model.dof_jntid[worst])).name
-        return (f"the simulation diverged at {self.data.time:.4f} s in joint '{joint}': shorten `time_step` (now "
-                f"{self.model.opt.timestep} s) or raise `relaxation` in the plant, or lower the tensions there")
-
-    def _speed(self) -> float:
-        """Fastest node [m/s] (and rotation [rad/s], which for a rod of about a metre is as telling)."""
-        return float(np.abs(self.data.cvel[self._nodes]).max())
 
     def _state(self, time: float) -> State:
         data = self.data
