@@ -33,8 +33,8 @@ setup(
     python_requires=">=3.11",
     install_requires=[
         "setuptools", "numpy", "scipy", "numba", "pydantic>=2", "pyyaml", "rosbags>=0.11", "typer", "rich",
-        "mujoco>=3.3", "open3d", "trimesh", "manifold3d", "coacd", "pandas", "pyarrow", "jinja2", "plotly", "matplotlib",
-        "pillow",
+        "mujoco>=3.3", "open3d", "trimesh", "manifold3d", "coacd", "pandas", "pyarrow", "jinja2", "plotly",
+        "matplotlib", "pillow",
     ],
     extras_require={
         # Where there is no ROS 2 installation, the same Jazzy packages as wheels.

@@ -90,10 +90,23 @@ def read_bag(path: str | Path, topics: tuple[str, ...] | None = None, namespace:
              on_error: Callable[[str, ConvertError], None] | None = None) -> Iterator[tuple[str, Any]]:
     """(relative topic, measurement, truth or record) of a bag folder or file, in the order of the log.
 
-    topics: only these (`tracker/` for all trackers). namespace: whose topics, where several robots are in the bag.
+    topics: only these (`tracker/` for all trackers). namespace: whose topics, where several robots are in the bag;
+    None or empty takes the only one.
     on_error: told about each message that cannot be used, which is then left out; without it the first one
     raises. Raises BagError naming the file, and what is valid.
     """
+    for topic, arrival, data in raw_messages(path, topics, namespace):
+        try:
+            yield topic, _decode(topic, data, arrival)
+        except ConvertError as error:
+            if on_error is None:
+                raise BagError(f"{path}: {error} (logged at {arrival / NANOSECONDS:.6f} s)") from None
+            on_error(topic, error)
+
+
+def raw_messages(path: str | Path, topics: tuple[str, ...] | None = None,
+                 namespace: str | None = None) -> Iterator[tuple[str, int, bytes]]:
+    """(relative topic, log time in ns, serialised message) of a bag, as `read_bag` selects them."""
     path = Path(path)
     with open_bag(path) as reader:
         names = contract_topics(path, reader.connections, namespace)
@@ -101,13 +114,7 @@ def read_bag(path: str | Path, topics: tuple[str, ...] | None = None, namespace:
         if not wanted:
             raise BagError(f"{path}: nothing to read; topics in it: {_listing(reader.connections)}")
         for connection, arrival, data in _messages(path, reader, wanted):
-            topic = names[connection.topic]
-            try:
-                yield topic, _decode(topic, connection.msgtype, data, arrival)
-            except ConvertError as error:
-                if on_error is None:
-                    raise BagError(f"{path}: {error} (logged at {arrival / NANOSECONDS:.6f} s)") from None
-                on_error(topic, error)
+            yield names[connection.topic], arrival, data
 
 
 @contextmanager
@@ -138,7 +145,7 @@ def contract_topics(path: Path, connections: list, namespace: str | None) -> dic
         if split is not None:
             found.setdefault(split[0], {})[connection.topic] = split[1]
     shared = found.pop("*", {})
-    if namespace is not None:
+    if namespace:
         return found.get(namespace.strip("/"), {}) | shared
     if len(found) > 1:
         raise BagError(f"{path}: holds several robots, choose one by its namespace: "
@@ -172,7 +179,8 @@ def _messages(path: Path, reader: Any, connections: list) -> Iterator[tuple[Any,
         raise BagError(f"{path}: damaged ({error or type(error).__name__}); `mcap recover` may mend it") from None
 
 
-def _decode(topic: str, type_name: str, data: bytes, arrival: int) -> Any:
+def _decode(topic: str, data: bytes, arrival: int) -> Any:
+    type_name = topic_spec(topic).type
     try:
         message = typestore().deserialize_cdr(data, type_name)
     except Exception as error:  # rosbags states no closed set of errors for damaged bytes

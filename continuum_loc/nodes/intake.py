@@ -1,0 +1,228 @@
+"""From messages to measurements that may be used: a queue that degrades in a defined order, and rules for stamps.
+
+Nothing here imports rclpy, so that all of it is tested without a graph.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from continuum_loc.measurements import (
+    EncoderSample,
+    FieldSample,
+    ImuSample,
+    Measurement,
+    StrainSample,
+    TofFrame,
+    TrackedPose,
+    nanoseconds,
+)
+from continuum_loc.nodes.settings import IntakeSettings
+from continuum_loc.robot import RobotDescription
+from msg_tools.convert import strain_is_stamped
+from msg_tools.errors import ConvertError
+from msg_tools.topics import TRACKER, topic_spec
+
+# What an overloaded node gives up first. IMU samples go last: they carry the motion between all others.
+SACRIFICE = ("tof/points", "strain", "imu/mag", TRACKER, "joint_states", "imu/data_raw")
+
+
+class Queued(NamedTuple):
+    """A message as it arrived: order of arrival, topic, message, ROS time (ns) and monotonic time (s) of arrival."""
+
+    order: int
+    topic: str
+    message: Any
+    arrival: int
+    received: float
+
+
+class Inbox:
+    """The queue between reception (one thread puts) and estimation (one thread takes), in the order of arrival."""
+
+    def __init__(self, settings: IntakeSettings) -> None:
+        self.settings = settings
+        self.dropped: Counter[str] = Counter()
+        self._queues: dict[str, deque[Queued]] = {name: deque() for name in SACRIFICE}
+        self._ready = threading.Condition()
+        self._order = 0
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def put(self, topic: str, message: Any, arrival: int) -> None:
+        """Queue a message; older ones are dropped where the queue has grown too long."""
+        kind = TRACKER if topic.startswith(TRACKER) else topic
+        with self._ready:
+            self._queues[kind].append(Queued(self._order, topic, message, arrival, time.monotonic()))
+            self._order += 1
+            self._size += 1
+            self._relieve()
+            self._ready.notify()
+
+    def take(self, timeout: float) -> Queued | None:
+        """The oldest message, or None when none came within `timeout` seconds."""
+        with self._ready:
+            if self._size == 0:
+                self._ready.wait(timeout)
+            heads = [queue for queue in self._queues.values() if queue]
+            if not heads:
+                return None
+            self._size -= 1
+            return min(heads, key=lambda queue: queue[0].order).popleft()
+
+    def clear(self) -> None:
+        """Forget everything queued."""
+        with self._ready:
+            for queue in self._queues.values():
+                queue.clear()
+            self._size = 0
+
+    def _relieve(self) -> None:
+        frames = self._queues[SACRIFICE[0]]
+        while frames and frames[-1].received - frames[0].received > self.settings.max_backlog:
+            self._drop(SACRIFICE[0])
+        while self._size > self.settings.queue_capacity:
+            self._drop(next(name for name in SACRIFICE if self._queues[name]))
+
+    def _drop(self, kind: str) -> None:
+        self._queues[kind].popleft()
+        self._size -= 1
+        self.dropped[kind] += 1
+
+
+class StampGate:
+    """Rules for stamps. `judge` returns None to use a sample, or the class of error under which it is refused.
+
+    A leap beyond the tolerance is believed when `jump_confirmations` samples in a row agree on it: forward it
+    is a gap, backward the data starts again (`restarts` counts those), as a looped bag does.
+    """
+
+    def __init__(self, settings: IntakeSettings) -> None:
+        self.settings = settings
+        self.restarts = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: the next stamp starts anew."""
+        self.newest: int | None = None
+        self._leap: list[int] = []
+        self._seen: dict[str, deque[int]] = {}
+
+    def judge(self, stamp: int, sensor: str, now: int) -> str | None:
+        """`stamp`, `now` in ns; now = 0 while a simulated clock has not begun."""
+        if stamp == 0:
+            return "zero stamp"
+        if now and stamp > now + nanoseconds(self.settings.future_tolerance):
+            return "future stamp"
+        if self._leaps(stamp) and not self._believed(stamp):
+            return "leap"
+        self._leap.clear()
+        seen = self._seen.setdefault(sensor, deque(maxlen=64))
+        if stamp in seen:
+            return "duplicate"
+        seen.append(stamp)
+        self.newest = stamp if self.newest is None else max(stamp, self.newest)
+        return None
+
+    def _leaps(self, stamp: int) -> bool:
+        return self.newest is not None and abs(stamp - self.newest) > nanoseconds(self.settings.jump_tolerance)
+
+    def _believed(self, stamp: int) -> bool:
+        if self._leap and abs(stamp - self._leap[-1]) > nanoseconds(self.settings.jump_tolerance):
+            self._leap.clear()
+        self._leap.append(stamp)
+        if len(self._leap) < self.settings.jump_confirmations:
+            return False
+        if stamp < self.newest:
+            self.reset()
+            self.restarts += 1
+        return True
+
+
+class Intake:
+    """Decodes, checks and counts. `report(kind, text)` is called once for each class of error."""
+
+    def __init__(self, robot: RobotDescription, settings: IntakeSettings, report: Callable[[str, str], None],
+                 frame_prefix: str = "") -> None:
+        self.robot, self.settings, self.frame_prefix = robot, settings, frame_prefix
+        self.gate = StampGate(settings)
+        self.received: Counter[str] = Counter()
+        self.used: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self._report = report
+        self._reported: set[str] = set()
+        self._zones = robot.tof_model.rows * robot.tof_model.columns
+        self._names = {TofFrame: _names(robot.tof), ImuSample: _names(robot.imu), FieldSample: _names(robot.hall),
+                       TrackedPose: _names(robot.sensors)}
+
+    def accept(self, topic: str, message: Any, arrival: int, now: int) -> Measurement | None:
+        """The measurement of a message, or None where it is refused (counted, and reported once per class)."""
+        self.received[topic] += 1
+        try:
+            measurement = self._checked(topic, message, arrival)
+            refusal = self.gate.judge(measurement.stamp, getattr(measurement, "sensor", topic), now)
+            if refusal:
+                raise ConvertError(refusal, f"{topic}: stamp {measurement.stamp / 1e9:.6f} s refused as {refusal} "
+                                   f"(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {now / 1e9:.6f} s)")
+        except ConvertError as error:
+            self.refuse(error.kind, str(error))
+            return None
+        self.used[topic] += 1
+        return measurement
+
+    def refuse(self, kind: str, text: str) -> None:
+        """Count an error, and report the first of its class."""
+        self.refused[kind] += 1
+        if kind not in self._reported:
+            self._reported.add(kind)
+            self._report(kind, text)
+
+    def _checked(self, topic: str, message: Any, arrival: int) -> Measurement:
+        if topic == "strain" and not strain_is_stamped(message) and "unstamped" not in self._reported:
+            self._reported.add("unstamped")
+            self._report("unstamped", "strain: data_offset is 0, so the arrival time has to serve as the stamp")
+        measurement = topic_spec(topic).decode(message, arrival, topic)
+        measurement = self._without_prefix(measurement)
+        names = self._names.get(type(measurement))
+        if names is not None and measurement.sensor not in names:
+            raise ConvertError("unknown frame", f"{topic}: robot '{self.robot.name}' has no such sensor "
+                               f"'{measurement.sensor}'; valid: {', '.join(names) or 'none of this kind'}")
+        self._check_content(topic, measurement)
+        return measurement
+
+    def _without_prefix(self, measurement: Any) -> Any:
+        prefix = self.frame_prefix
+        if prefix and getattr(measurement, "sensor", "").startswith(prefix):
+            return replace(measurement, sensor=measurement.sensor[len(prefix):])
+        return measurement
+
+    def _check_content(self, topic: str, measurement: Measurement) -> None:
+        if isinstance(measurement, TofFrame) and len(measurement.ranges) != self._zones:
+            raise ConvertError("zones", f"{topic}: {len(measurement.ranges)} zones of '{measurement.sensor}'; the "
+                               f"robot description says {self._zones}")
+        if isinstance(measurement, StrainSample):
+            self._check_stations(topic, measurement.s)
+        if isinstance(measurement, EncoderSample) and "insertion" in measurement.names:
+            travel = measurement.position[measurement.names.index("insertion")]
+            if not np.isfinite(travel):
+                raise ConvertError("value", f"{topic}: the position of joint 'insertion' is {travel}")
+
+    def _check_stations(self, topic: str, s: np.ndarray) -> None:
+        if self.robot.strain is None:
+            raise ConvertError("unknown frame", f"{topic}: robot '{self.robot.name}' has no strain sensor")
+        if s.min() < -1e-6 or s.max() > self.robot.length + 1e-6 or (np.diff(s) <= 0.0).any():
+            raise ConvertError("value", f"{topic}: stations s must rise within 0 to {self.robot.length} m, got "
+                               f"{s.min():.4g} to {s.max():.4g}")
+
+
+def _names(sensors: tuple) -> tuple[str, ...]:
+    return tuple(sensor.name for sensor in sensors)

@@ -1,0 +1,92 @@
+"""Samples of the future at the right time: a thread prepares them ahead, a caller publishes them when due."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from queue import Empty, Full, Queue
+from typing import Any
+
+from continuum_loc.measurements import NANOSECONDS
+
+_END = object()
+POLL = 0.1  # s; how often a blocked thread looks whether it has to stop
+
+
+class Paced:
+    """Delivers (stamp, item) pairs of an iterator when their time has come.
+
+    lookahead [s]: how far the iterator may run ahead. rate: data seconds per second.
+    """
+
+    def __init__(self, items: Iterator[tuple[int, Any]], lookahead: float, rate: float = 1.0) -> None:
+        self._items, self._lookahead, self._rate = items, lookahead, rate
+        self._queue: Queue[Any] = Queue(maxsize=4000)
+        self._stop = threading.Event()
+        self._progress = 0  # data stamp delivered last
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._prepare, name="lookahead", daemon=True)
+
+    def run(self, deliver: Callable[[int, Any, float], None],
+            on_start: Callable[[int], None] = lambda stamp: None) -> None:
+        """Deliver everything, then return; `stop` from another thread ends it early.
+
+        `deliver(stamp, item, delay)`: delay [s] behind the item's time. `on_start(first stamp)` is called when the
+        first item is prepared, and due one lookahead from now.
+        """
+        self._thread.start()
+        begin: float | None = None
+        for stamp, item in self._prepared():
+            if begin is None:
+                begin, first, self._progress = time.monotonic() + self._lookahead, stamp, stamp
+                on_start(stamp)
+            due = begin + (stamp - first) / NANOSECONDS / self._rate
+            if not self._wait_until(due):
+                break
+            self._progress = stamp
+            deliver(stamp, item, time.monotonic() - due)
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        """End `run` soon."""
+        self._stop.set()
+
+    def _prepared(self) -> Iterator[tuple[int, Any]]:
+        while not self._stop.is_set():
+            try:
+                entry = self._queue.get(timeout=POLL)
+            except Empty:
+                continue
+            if entry is _END:
+                return
+            yield entry
+
+    def _wait_until(self, due: float) -> bool:
+        remaining = due - time.monotonic()
+        while remaining > 0.0 and not self._stop.is_set():
+            time.sleep(min(remaining, POLL))
+            remaining = due - time.monotonic()
+        return not self._stop.is_set()
+
+    def _prepare(self) -> None:
+        try:
+            for stamp, item in self._items:
+                if not self._put((stamp, item), stamp):
+                    return
+        except BaseException as error:  # handed to the thread that delivers
+            self._error = error
+        self._put(_END, 0)
+
+    def _put(self, entry: Any, stamp: int) -> bool:
+        ahead = self._lookahead * self._rate * NANOSECONDS
+        while self._progress and stamp - self._progress > ahead and not self._stop.is_set():
+            time.sleep(0.002)
+        while not self._stop.is_set():
+            try:
+                self._queue.put(entry, timeout=POLL)
+                return True
+            except Full:
+                continue
+        return False

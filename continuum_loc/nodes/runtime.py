@@ -1,0 +1,146 @@
+"""Starting, spinning and stopping a node; quality of service; latency bookkeeping."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+
+from continuum_loc.nodes.parameters import declare, refuse_unknown
+from continuum_loc.settings import Settings, SettingsError
+from msg_tools.errors import BagError, ConvertError
+from msg_tools.topics import Topic
+
+BAD_INPUT = 2
+
+
+class PackageNode(Node):
+    """A node with typed settings that can end by itself: `finish` ends its spin."""
+
+    def __init__(self, name: str, defaults: Settings, **options: Any) -> None:
+        super().__init__(name, **options)
+        self.finished = Future()
+        self.settings = declare(self, defaults)
+
+    def finish(self) -> None:
+        """End the spin of this node (from any thread)."""
+        if not self.finished.done():
+            self.finished.set_result(None)
+
+    def close(self) -> None:
+        """Stop threads, write files. Called once, after the last callback."""
+
+    def now(self) -> int:
+        """The node's clock in integer nanoseconds (0 while a simulated clock has not begun)."""
+        return self.get_clock().now().nanoseconds
+
+    def check_parameters(self) -> None:
+        """Refuse parameters that this node does not have; call it when all are declared."""
+        refuse_unknown(self)
+
+
+def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
+    """Make a node and spin it until it finishes or is told to stop. Returns the exit code (2: bad input)."""
+    _provide_log_folder()
+    rclpy.init(args=args)
+    node: PackageNode | None = None
+    try:
+        node = make()
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception as error:  # a signal may surface as any of rclpy's errors, from a publish in flight for instance
+        if rclpy.ok():
+            return _complain(error)
+    finally:
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _spin(node: PackageNode) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin_until_future_complete(node.finished)
+    finally:
+        executor.remove_node(node)
+
+
+def _complain(error: Exception) -> int:
+    """One clear line for what the user can mend; the traceback for what only we can."""
+    from continuum_loc.mapping.errors import MapError
+
+    known = (SettingsError, MapError, BagError, ConvertError)
+    if isinstance(error, known) or type(error).__name__ in ("SceneError", "SimulationDiverged"):
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    raise error
+
+
+def _provide_log_folder() -> None:
+    """rclpy.init fails where it finds no place for logs, as in a container without HOME."""
+    if not any(os.environ.get(name) for name in ("HOME", "ROS_HOME", "ROS_LOG_DIR")):
+        os.environ["ROS_LOG_DIR"] = tempfile.gettempdir()
+
+
+def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
+    """Best effort hears reliable and best-effort publishers alike; the depth bridges a slow moment."""
+    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=reliability)
+
+
+def output_qos(topic: Topic) -> QoSProfile:
+    """Reliable, which every subscription accepts; latched where the contract says so."""
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=ReliabilityPolicy.RELIABLE,
+                      durability=durability)
+
+
+def write_summary(path: str, data: dict[str, Any]) -> None:
+    """Write a node's summary as JSON, whole or not at all; nothing where `path` is empty."""
+    if not path:
+        return
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_suffix(".partial")
+    partial.write_text(json.dumps(data, indent=1))
+    partial.replace(target)
+
+
+class Delays:
+    """Delays in seconds: the newest 100,000 of them, so that memory stays bounded."""
+
+    def __init__(self) -> None:
+        self.values: deque[float] = deque(maxlen=100_000)
+
+    def add(self, seconds: float) -> None:
+        """Note one delay."""
+        self.values.append(seconds)
+
+    def statistics(self) -> dict[str, float]:
+        """Count, mean, p50, p95, p99 and maximum in milliseconds; empty when there was none."""
+        if not self.values:
+            return {}
+        ms = 1e3 * np.array(self.values)
+        p50, p95, p99 = np.percentile(ms, (50, 95, 99))
+        return {"count": len(ms), "mean": float(ms.mean()), "p50": float(p50), "p95": float(p95), "p99": float(p99),
+                "max": float(ms.max())}
+
+    def recent(self, count: int) -> np.ndarray:
+        """(<= count,) the newest delays [s]."""
+        return np.array(list(self.values)[-count:])
