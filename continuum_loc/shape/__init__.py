@@ -1,0 +1,5 @@
+"""The shape of a continuum robot from Hall sensors and IMUs (start with `estimator`)."""
+
+from continuum_loc.shape.estimator import ShapeEstimate, ShapeEstimator, ShapeSettings, load_shape_settings
+
+__all__ = ["ShapeEstimate", "ShapeEstimator", "ShapeSettings", "load_shape_settings"]

@@ -76,6 +76,10 @@ class PositionSolver:
         starts = np.stack([prior, closed_form, -closed_form], axis=1)
         return PositionFit(*_solve_all(self.parameters, field, starts, self.lower, self.upper))
 
+    def field(self, position: np.ndarray) -> np.ndarray:
+        """(M, 3) field [T] of the model at `position` (M, 3) [m]."""
+        return field_and_gradient(self.magnet, position, self.model)[0]
+
     def covariance(self, position: np.ndarray, field: np.ndarray, sigma: float, attitude: np.ndarray,
                    ) -> tuple[np.ndarray, np.ndarray]:
         """(M, 6, 6) covariance of position and attitude errors in the magnet's frame, and observability (M,).

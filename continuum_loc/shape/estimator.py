@@ -1,0 +1,395 @@
+"""The shape of a Hall + IMU arm, online: samples of asynchronous modules in, poses and a curve out.
+
+First the robot rests: the gyro biases are averaged and, where the arm starts straight, mounts and magnet are
+tared or checked. Then each sample updates its own module; at every due instant of data time the modules'
+attitudes and fields give positions (eq. 10, or all jointly) and the curve through them. A module that is
+silent, saturated or frozen is told and left out: its pose is then the backbone's, held by its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import permutations
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from continuum_loc import lie
+from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds, seconds
+from continuum_loc.robot import RobotDescription
+from continuum_loc.settings import Settings, load_settings
+from continuum_loc.shape.attitude import AttitudeSettings, EulerFilter, GravityFilter, level
+from continuum_loc.shape.backbone import BackboneFit, BackboneSolver
+from continuum_loc.shape.calibration import (
+    Calibration,
+    CalibrationError,
+    PosedRest,
+    calibrate,
+    check_wiring,
+    load_calibration,
+    module_mounts,
+    nominal_calibration,
+    straight_modules,
+)
+from continuum_loc.shape.curves import CurveMethod, arclength, extended, fit_curve
+from continuum_loc.shape.magnet import FieldModel
+from continuum_loc.shape.position import PositionSolver
+from continuum_loc.shape.rest import MotionError, Rest, RestWindow
+
+Status = Literal["taring", "tracking", "degraded", "faulty"]
+
+
+class ShapeSettings(Settings):
+    """Settings of the Hall + IMU shape estimator."""
+
+    rate: float = Field(25.0, gt=0.0, description="estimates per second of data time [Hz]")
+    start: Literal["straight", "anyhow"] = Field(
+        "straight", description="shape during taring: straight also tares mounts and checks the wiring; anyhow "
+                                "only averages the gyro bias, and yaw then starts from the base's")
+    taring_seconds: float = Field(1.0, gt=0.0, description="rest at the start [s]")
+    calibration: Path | None = Field(None, description="file of `calibrate`; none: tare at the start")
+    attitude: AttitudeSettings = AttitudeSettings()
+    attitude_filter: Literal["so3", "euler"] = Field("so3", description="euler: the paper's eqs. 3-6, mended")
+    field_model: FieldModel = "ring"
+    position: Literal["modules", "joint"] = Field("modules", description="eq. 10 by module, or one smooth backbone")
+    curve: CurveMethod = "kasa_arc"
+    projected: bool = Field(False, description="the paper's projected curves instead of the spatial ones")
+    curve_points: int = Field(61, ge=4, description="points along the curve up to the last module")
+    smoothing: float = Field(0.2, ge=0.0, description="time constant of the field's average while a module rests [s]")
+    still: float = Field(0.012, gt=0.0, description="a module turning slower rests [rad/s]")
+    silent_after: float = Field(0.1, gt=0.0, description="a module without samples for longer is silent [s]")
+    frozen_after: int = Field(10, ge=2, description="as many equal readings in a row are a frozen sensor")
+    misfit: float = Field(25.0, gt=1.0, description="normalised misfit of the joint fit from which wiring is suspect")
+
+
+def load_shape_settings(path: str | Path | None = None) -> ShapeSettings:
+    """Settings from a YAML file, or the defaults."""
+    return ShapeSettings() if path is None else load_settings(ShapeSettings, path)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShapeEstimate:
+    """The arm at one instant; M modules base to tip, named by their rings.
+
+    T_map_module: (M, 4, 4). covariance: (M, 6, 6) of a right perturbation [rho; phi] (m, rad).
+    curve: (C, 3) points in map from the magnet to the tip [m], at arclengths curve_s (C,) [m].
+    observable: (M,) whether the module's own field fixes its position. bound: (M, 3) of `PositionFit`.
+    yaw_sigma: (M,) rad; gravity never corrects yaw, so this only grows.
+    faults: what is wrong, by module; empty when all is well. consistency: normalised misfit of the joint fit.
+    """
+
+    stamp: int
+    modules: tuple[str, ...]
+    T_map_module: np.ndarray
+    covariance: np.ndarray
+    curve: np.ndarray
+    curve_s: np.ndarray
+    observable: np.ndarray
+    bound: np.ndarray
+    yaw_sigma: np.ndarray
+    status: Status
+    faults: dict[str, tuple[str, ...]]
+    consistency: float
+
+
+@dataclass(eq=False)
+class _Stream:
+    """One sensor's last reading, and what its readings look like."""
+
+    stamp: int | None = None
+    reading: np.ndarray | None = None
+    repeats: int = 0
+    saturated: bool = False
+
+    def take(self, stamp: int, reading: np.ndarray, full_scale: np.ndarray) -> bool:
+        """Note a reading. False when it is no newer than the last."""
+        if self.stamp is not None and stamp <= self.stamp:
+            return False
+        same = self.reading is not None and np.array_equal(reading, self.reading, equal_nan=True)
+        self.repeats = self.repeats + 1 if same else 1
+        self.saturated = not (np.abs(reading) < full_scale).all()  # also where an axis is nan
+        self.stamp, self.reading = stamp, reading
+        return True
+
+
+@dataclass(eq=False)
+class _Module:
+    """One module's streams and filter state."""
+
+    name: str
+    filter: GravityFilter | EulerFilter
+    imu: _Stream = field(default_factory=_Stream)
+    hall: _Stream = field(default_factory=_Stream)
+    field_base: np.ndarray | None = None  # smoothed total field in the base frame [T]
+
+
+class ShapeEstimator:
+    """See the module's docstring. `process` takes samples in any order of modules; stamps of one sensor ascend."""
+
+    def __init__(self, robot: RobotDescription, settings: ShapeSettings | None = None,
+                 calibration: Calibration | None = None) -> None:
+        self.robot, self.settings = robot, settings or ShapeSettings()
+        module_mounts(robot)  # refuses a robot without modules
+        if calibration is None and self.settings.calibration is not None:
+            calibration = load_calibration(self.settings.calibration, robot)
+        if calibration is not None:
+            calibration.check(robot)
+        self._given = calibration
+        self._index = {sensor.name: m for sensors in (robot.imu, robot.hall) for m, sensor in enumerate(sensors)}
+        self._full_scale = (np.repeat([robot.imu_model.gyro_range, robot.imu_model.accel_range], 3),
+                            np.asarray(robot.hall_model.saturation) + 0.5 * np.asarray(robot.hall_model.lsb))
+        self.reset()
+
+    def reset(self) -> None:
+        """Start over with taring."""
+        self.T_map_base = self.robot.base.T_map_base
+        self.status: Status = "taring"
+        self.message = ""
+        self.counts: Counter[str] = Counter()
+        self.faults: dict[str, tuple[str, ...]] = {}
+        self._window = RestWindow(self.robot)
+        self._window_end: int | None = None
+        self._next_due: int | None = None
+        self._modules = [_Module(ring, self._new_filter()) for ring in self.module_names]
+        self._use(self._given or nominal_calibration(self.robot))
+
+    @property
+    def module_names(self) -> tuple[str, ...]:
+        """Names of the modules' rings, base to tip."""
+        return tuple(sensor.ring for sensor in self.robot.hall)
+
+    def process(self, sample: ImuSample | FieldSample) -> ShapeEstimate | None:
+        """Take one sample; an estimate when one fell due. Samples of other sensors are counted and ignored.
+
+        Raises ValueError for a sample that is not finite where a full scale cannot be the reason.
+        """
+        if not isinstance(sample, (ImuSample, FieldSample)) or sample.sensor not in self._index:
+            self.counts["ignored"] += 1
+            return None
+        module = self._modules[self._index[sample.sensor]]
+        if isinstance(sample, ImuSample):
+            reading, stream, full = np.concatenate([sample.angular_velocity, sample.linear_acceleration]), module.imu, 0
+            if not np.isfinite(reading).all():
+                raise ValueError(f"IMU sample of '{sample.sensor}' at {sample.stamp} is not finite: {reading.tolist()}")
+        else:
+            reading, stream, full = np.asarray(sample.field, float), module.hall, 1
+        if not stream.take(sample.stamp, reading, self._full_scale[full]):
+            self.counts["out of order"] += 1
+            return None
+        self.counts["used"] += 1
+        if self.status == "taring" or self._next_due is None:
+            self._tare(sample)
+            return None
+        if isinstance(sample, ImuSample):
+            self._turn(module, sample)
+        elif not stream.saturated:
+            self._sense(module, sample)
+        return self._estimate_if_due(sample.stamp)
+
+    # Taring
+
+    def _new_filter(self) -> GravityFilter | EulerFilter:
+        if self.settings.attitude_filter == "euler":
+            return EulerFilter()
+        imu = self.robot.imu_model
+        return GravityFilter(self.settings.attitude, imu.gyro_sigma, imu.accel_sigma)
+
+    def _tare(self, sample: ImuSample | FieldSample) -> None:
+        """Average a rest; motion or wrong wiring is told and taring starts again."""
+        if self._window_end is None:
+            self._window_end = sample.stamp + nanoseconds(self.settings.taring_seconds)
+        if sample.stamp < self._window_end:
+            self._window.add(sample)
+            return
+        window, self._window, self._window_end = self._window, RestWindow(self.robot), None
+        try:
+            self._begin(window.finish(), sample.stamp)
+        except (MotionError, CalibrationError, ValueError) as error:
+            self.status, self.message = "taring" if isinstance(error, MotionError) else "faulty", str(error)
+            self.counts["taring refused"] += 1
+
+    def _begin(self, rest: Rest, stamp: int) -> None:
+        if self.settings.start == "straight":
+            posed = PosedRest(rest, self.T_map_base, straight_modules(self.robot))
+            check_wiring(self.robot, posed, self.settings.field_model)
+            if self._given is None:
+                self._use(calibrate(self.robot, [posed], model=self.settings.field_model))
+        yaw_sigma = 0.0 if self.settings.start == "straight" else np.radians(10.0)
+        for m, module in enumerate(self._modules):
+            accel = rest.accel[m] - self._accel_offset[m]
+            if isinstance(module.filter, GravityFilter):
+                R_map_imu = level(self.T_map_base[:3, :3] @ self._R_module_imu[m], accel)
+                module.filter.start(stamp, R_map_imu, rest.gyro[m], yaw_sigma)
+            else:
+                module.filter.update(stamp, np.zeros(3), accel)
+                module.filter.bias = rest.gyro[m]
+        self.status, self.message, self._next_due = "tracking", "", stamp
+
+    def _use(self, calibration: Calibration) -> None:
+        """Set everything that follows from a calibration."""
+        self.calibration = calibration
+        imu_mount, hall_mount = module_mounts(self.robot)
+        columns = {name: np.array([getattr(module, name) for module in calibration.modules])
+                   for name in ("accel_offset", "imu_turn", "hall_offset", "hall_turn")}
+        self._accel_offset, self._hall_offset = columns["accel_offset"], columns["hall_offset"]
+        self._R_module_imu = imu_mount @ lie.so3_exp(columns["imu_turn"])
+        self._R_module_hall = hall_mount @ lie.so3_exp(columns["hall_turn"])
+        magnet = self.robot.magnet.model_copy(update={"remanence": calibration.remanence})
+        self._robot = self.robot.model_copy(update={"magnet": magnet})
+        s = straight_modules(self.robot)[:, 0, 3]
+        self._positions = PositionSolver(magnet, s - magnet.s, self.settings.field_model)
+        self._backbone = BackboneSolver(self._robot, s, self.settings.field_model)
+
+    # Samples
+
+    def _turn(self, module: _Module, sample: ImuSample) -> None:
+        m = self._index[sample.sensor]
+        accel = sample.linear_acceleration - self._accel_offset[m]
+        if isinstance(module.filter, GravityFilter):
+            module.filter.update(sample.stamp, sample.angular_velocity, accel)
+        else:
+            module.filter.update(sample.stamp, sample.angular_velocity - module.filter.bias, accel)
+
+    def _sense(self, module: _Module, sample: FieldSample) -> None:
+        """Smooth the field in the base frame, where it stands still as long as the module does."""
+        m = self._index[sample.sensor]
+        R_base_hall = self._R_base_module(m, sample.stamp) @ self._R_module_hall[m]
+        field_base = R_base_hall @ (sample.field - self._hall_offset[m])
+        rate = module.filter.rate if isinstance(module.filter, GravityFilter) else np.full(3, np.inf)
+        if module.field_base is None or self.settings.smoothing == 0.0 or np.linalg.norm(rate) > self.settings.still:
+            module.field_base = field_base
+        else:
+            gain = 1.0 - np.exp(-1.0 / (self.robot.hall_model.rate * self.settings.smoothing))
+            module.field_base = module.field_base + gain * (field_base - module.field_base)
+
+    def _R_base_module(self, m: int, stamp: int) -> np.ndarray:
+        attitude = self._modules[m].filter
+        R_map_imu = attitude.rotation_at(stamp) if isinstance(attitude, GravityFilter) else attitude.R_map_imu
+        return self.T_map_base[:3, :3].T @ R_map_imu @ self._R_module_imu[m].T
+
+    # Estimates
+
+    def _estimate_if_due(self, stamp: int) -> ShapeEstimate | None:
+        if stamp < self._next_due:
+            return None
+        period = nanoseconds(1.0 / self.settings.rate)
+        self._next_due += period * (1 + (stamp - self._next_due) // period)
+        return self._estimate(stamp)
+
+    def _estimate(self, stamp: int) -> ShapeEstimate | None:
+        self.faults = self._find_faults(stamp)
+        good = np.array([module.name not in self.faults for module in self._modules])
+        if not good.any():
+            self.status, self.message = "faulty", "no module can be used"
+            return None
+        R = np.stack([self._R_base_module(m, stamp) for m in range(len(good))])
+        earth = self.T_map_base[:3, :3].T @ self.calibration.earth_field
+        attitude = self._attitude_covariance()
+        joint = self._joint(good, R, earth, attitude)
+        if joint.consistency > self.settings.misfit:
+            self._suspect_wiring(good, R, earth, attitude, joint)
+        T, covariance, bound, observable = joint.T_base_module, joint.covariance, np.zeros((len(good), 3), int), good
+        if self.settings.position == "modules":
+            T, covariance, bound, observable = self._by_module(good, R, earth, attitude, joint)
+        return self._describe(stamp, T, covariance, bound, observable, joint.consistency)
+
+    def _find_faults(self, stamp: int) -> dict[str, tuple[str, ...]]:
+        """Silent, saturated and frozen modules."""
+        found = {}
+        for module in self._modules:
+            texts = []
+            for kind, stream in (("imu", module.imu), ("hall", module.hall)):
+                if stream.stamp is None or seconds(stamp, stream.stamp) > self.settings.silent_after:
+                    texts.append(f"{kind} silent")
+                elif stream.repeats >= self.settings.frozen_after:
+                    texts.append(f"{kind} frozen")
+                elif stream.saturated:
+                    texts.append(f"{kind} saturated")
+            if not texts and module.field_base is None:
+                texts.append("hall has not reported yet")
+            if texts:
+                found[module.name] = tuple(texts)
+        return found
+
+    def _attitude_covariance(self) -> np.ndarray:
+        """(M, 3, 3) of the modules' rotations in base axes, mounting included [rad^2]."""
+        R_base_map = self.T_map_base[:3, :3].T
+        mounting = self.calibration.mounting_sigma**2 * np.eye(3)
+        filters = [module.filter for module in self._modules]
+        own = [f.covariance if isinstance(f, GravityFilter) else np.radians(1.0) ** 2 * np.eye(3) for f in filters]
+        return np.stack([R_base_map @ P @ R_base_map.T + mounting for P in own])
+
+    def _fields(self, good: np.ndarray) -> np.ndarray:
+        """(M, 3) smoothed total fields in the base frame; zero for modules that are left out."""
+        pairs = zip(self._modules, good, strict=True)
+        return np.stack([module.field_base if used else np.zeros(3) for module, used in pairs])
+
+    def _joint(self, good: np.ndarray, R: np.ndarray, earth: np.ndarray, attitude: np.ndarray,
+               order: tuple[int, ...] | None = None, sign: float = 1.0) -> BackboneFit:
+        """The joint fit; `order` and `sign` try another wiring or a reversed magnet."""
+        order = list(order) if order is not None else list(range(len(good)))
+        in_module = np.einsum("mji,mj->mi", R, self._fields(good))[order]
+        # What the calibration leaves in the mounts turns every field, beside the sensor's own noise.
+        turned = np.linalg.norm(in_module, axis=1, keepdims=True) * self.calibration.mounting_sigma
+        sigma = np.where(good[order, None], np.hypot(self.robot.hall_model.sigma, turned), np.inf)
+        information = np.linalg.inv(attitude)
+        information = np.where(good[:, None, None], R.swapaxes(1, 2) @ information @ R, 0.0)[order]
+        return self._backbone.solve(sign * in_module, np.broadcast_to(sigma, in_module.shape), sign * earth, R[order],
+                                    information)
+
+    def _by_module(self, good: np.ndarray, R: np.ndarray, earth: np.ndarray, attitude: np.ndarray,
+                   joint: BackboneFit) -> tuple[np.ndarray, ...]:
+        """Eq. 10 for the good modules, the joint fit's pose for the others."""
+        offset = np.array([self.robot.magnet.s, 0.0, 0.0])
+        prior = joint.T_base_module[:, :3, 3] - offset
+        # A module left out solves the field of its own prior, which changes nothing.
+        source = np.where(good[:, None], self._fields(good) - earth, self._positions.field(prior))
+        fit = self._positions.solve(source, prior)
+        own, observable = self._positions.covariance(fit.position, source, self.robot.hall_model.sigma, attitude)
+        T = joint.T_base_module.copy()
+        T[good, :3, :3] = R[good]
+        T[good, :3, 3] = fit.position[good] + offset
+        covariance = joint.covariance.copy()
+        to_body = np.zeros_like(own)
+        to_body[:, :3, :3] = to_body[:, 3:, 3:] = R.swapaxes(1, 2)
+        covariance[good] = (to_body @ own @ to_body.swapaxes(1, 2))[good]
+        for m in np.flatnonzero(good & fit.ambiguous):
+            self.faults[self._modules[m].name] = ("position ambiguous",)
+        return T, covariance, fit.bound, observable & good
+
+    def _suspect_wiring(self, good: np.ndarray, R: np.ndarray, earth: np.ndarray, attitude: np.ndarray,
+                        joint: BackboneFit) -> None:
+        """A joint fit this bad has a reason: try every order of the modules, and the magnet upside down."""
+        identity = tuple(range(len(good)))
+        trials = {(order, sign): self._joint(good, R, earth, attitude, order, sign).consistency
+                  for order in permutations(identity) for sign in (1.0, -1.0)}
+        (order, sign), best = min(trials.items(), key=lambda item: item[1])
+        if best > 0.2 * joint.consistency:
+            texts = dict.fromkeys(identity, "does not fit the backbone")
+        elif sign < 0.0:
+            texts = dict.fromkeys(identity, "magnet upside down")
+        else:
+            texts = {which: f"swapped with {self._modules[place].name}"
+                     for place, which in enumerate(order) if place != which}
+        for m, text in texts.items():
+            name = self._modules[m].name
+            self.faults[name] = (*self.faults.get(name, ()), text)
+
+    def _describe(self, stamp: int, T_base_module: np.ndarray, covariance: np.ndarray, bound: np.ndarray,
+                  observable: np.ndarray, consistency: float) -> ShapeEstimate:
+        settings = self.settings
+        root = np.array([[self.robot.magnet.s, 0.0, 0.0]])
+        points = np.concatenate([root, T_base_module[:, :3, 3]]) - root
+        tangents = np.concatenate([[[1.0, 0.0, 0.0]], T_base_module[:, :3, 0]])
+        curve = fit_curve(points, tangents, settings.curve, settings.projected, settings.curve_points)
+        curve = extended(curve, self.robot.length - self.robot.magnet.s) + root
+        self.status = "degraded" if self.faults else "tracking"
+        self.message = "; ".join(f"{name}: {', '.join(texts)}" for name, texts in self.faults.items())
+        R, p = self.T_map_base[:3, :3], self.T_map_base[:3, 3]
+        yaw = [m.filter.yaw_sigma if isinstance(m.filter, GravityFilter) else np.inf for m in self._modules]
+        return ShapeEstimate(stamp, self.module_names, self.T_map_base @ T_base_module, covariance, curve @ R.T + p,
+                             arclength(curve) + self.robot.magnet.s, observable, bound, np.array(yaw), self.status,
+                             dict(self.faults), consistency)
