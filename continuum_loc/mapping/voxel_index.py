@@ -24,37 +24,44 @@ from continuum_loc.mapping.errors import MapError
 
 BLOCK = 4  # voxels along a block's edge
 BLOCK_VOXELS = BLOCK**3
-POINTS_PER_VOXEL = 10.0  # mean over occupied voxels: balances the length of lists against their number
+POINTS_PER_VOXEL = 3.2  # mean over occupied voxels; makes lists of about 15, where their length and number balance
 AXIS_BITS = 21
+AXIS_MASK = (1 << AXIS_BITS) - 1
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
 FAR, CROWDED = -1, -2  # instead of a list's length: no point within reach; too many candidates
+COUNTERS = 2  # rows after the cell table: [cells in use, pool rows in use], [lists made, times emptied]
 
 
 class VoxelArrays(NamedTuple):
-    """The index as arrays. Kernels take it whole; only the cache arrays and `state` are ever written.
+    """The index as arrays and scalars. Kernels take it whole; only `cell_slots` and `pool` are ever written.
 
-    points: (P, 3) sorted by voxel [m]; order: (P,) their rows in the caller's cloud.
-    geometry: (6,) origin x, y, z, voxel edge, its inverse, reach of the candidate lists [m].
-    blocks: (3,) extent of the map in blocks.
-    block_slots: (H, 2) hash table of block key and block number; block_keys: (B,) key of each block.
+    Kept to few arrays on purpose: handing each one from kernel to kernel costs as much as a tenth of a lookup.
+
+    points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by voxel.
+    block_slots: (H, 2) hash table from a block's key to its number.
     voxel_start: (B * 64 + 1,) first sorted point of each voxel.
-    cell_slots: (C, 2) hash table of cell key and packed list (start * 2^16 + length + 2).
-    pool: (L,) sorted-point numbers, the lists end to end.
-    state: (4,) cells in use, pool in use, lists made, times emptied.
+    cell_slots: (C + COUNTERS, 2) hash table from a cell's key to its packed list (start * 2^16 + length + 2).
+    pool: (L, 4) the lists end to end: rows of `points`.
+    x0, y0, z0: origin [m]; voxel: edge [m]; blocks_x, blocks_y, blocks_z: extent of the map in blocks;
+    reach: distance [m] up to which lists are made.
     """
 
     points: np.ndarray
-    order: np.ndarray
-    geometry: np.ndarray
-    blocks: np.ndarray
     block_slots: np.ndarray
-    block_keys: np.ndarray
     voxel_start: np.ndarray
     cell_slots: np.ndarray
     pool: np.ndarray
-    state: np.ndarray
+    x0: float
+    y0: float
+    z0: float
+    voxel: float
+    inverse_voxel: float
+    blocks_x: int
+    blocks_y: int
+    blocks_z: int
+    reach: float
 
 
 @njit(cache=True, inline="always")
@@ -69,9 +76,8 @@ def _hash(key, mask):
 
 
 @njit(cache=True)
-def _find_slot(slots, key):
-    """Row of `key` in the table, or of the free row where it belongs."""
-    mask = slots.shape[0] - 1
+def _find_slot(slots, key, mask):
+    """Row of `key` in a table of mask + 1 rows, or of the free row where it belongs."""
     row = _hash(key, mask)
     while slots[row, 0] != key and slots[row, 0] != -1:
         row = (row + 1) & mask
@@ -108,26 +114,20 @@ def _morton_codes(points, origin, inverse_voxel):
 
 
 @njit(cache=True)
-def _fill_blocks(points, codes, origin, inverse_voxel, block_slots, block_keys, voxel_start):
+def _fill_blocks(codes, keys, block_slots, voxel_start):
     """Enter the sorted points' blocks in the hash table and note where each voxel's points start."""
-    block, last = -1, np.int64(-1)
-    voxel = 0
-    for p in range(points.shape[0]):
+    block, last, voxel = -1, np.int64(-1), 0
+    for p in range(codes.shape[0]):
         if codes[p] >> 6 != last:
             last = codes[p] >> 6
             block += 1
-            i = np.int64(np.floor((points[p, 0] - origin[0]) * inverse_voxel)) // BLOCK
-            j = np.int64(np.floor((points[p, 1] - origin[1]) * inverse_voxel)) // BLOCK
-            k = np.int64(np.floor((points[p, 2] - origin[2]) * inverse_voxel)) // BLOCK
-            key = _pack(i, j, k)
-            row = _find_slot(block_slots, key)
-            block_slots[row, 0], block_slots[row, 1] = key, block
-            block_keys[block] = key
+            row = _find_slot(block_slots, keys[p], block_slots.shape[0] - 1)
+            block_slots[row, 0], block_slots[row, 1] = keys[p], block
         here = block * BLOCK_VOXELS + (codes[p] & 63)
         while voxel <= here:
             voxel_start[voxel] = p
             voxel += 1
-    voxel_start[voxel:] = points.shape[0]
+    voxel_start[voxel:] = codes.shape[0]
 
 
 @njit(cache=True, inline="always")
@@ -138,11 +138,10 @@ def _axis_gap(x, low, high):
 @njit(cache=True)
 def _block_distance2(arrays, key, x, y, z):
     """Squared distance from a point to a block's box, a little less, so that rounding never rules out a hit."""
-    edge = arrays.geometry[3] * BLOCK
-    mask = (1 << AXIS_BITS) - 1
-    x0 = arrays.geometry[0] + (key >> (2 * AXIS_BITS)) * edge
-    y0 = arrays.geometry[1] + ((key >> AXIS_BITS) & mask) * edge
-    z0 = arrays.geometry[2] + (key & mask) * edge
+    edge = arrays.voxel * BLOCK
+    x0 = arrays.x0 + (key >> (2 * AXIS_BITS)) * edge
+    y0 = arrays.y0 + ((key >> AXIS_BITS) & AXIS_MASK) * edge
+    z0 = arrays.z0 + (key & AXIS_MASK) * edge
     gx = _axis_gap(x, x0, x0 + edge)
     gy = _axis_gap(y, y0, y0 + edge)
     gz = _axis_gap(z, z0, z0 + edge)
@@ -150,33 +149,28 @@ def _block_distance2(arrays, key, x, y, z):
 
 
 @njit(cache=True, inline="always")
-def _voxel_range(x, radius, origin, inverse_voxel, first):
-    """Voxels 0..3 of the block starting at voxel `first` that x +- radius covers, as a half-open range."""
-    low = np.floor((x - radius - origin) * inverse_voxel) - first
-    high = np.floor((x + radius - origin) * inverse_voxel) - first
+def _voxel_range(offset, radius, inverse_voxel, first):
+    """Half-open range 0..4 of a block's voxels, along one axis, that offset +- radius covers."""
+    radius = radius * (1.0 + 1e-9) + 1e-12
+    low = np.floor((offset - radius) * inverse_voxel) - first
+    high = np.floor((offset + radius) * inverse_voxel) - first
     return int(max(low, 0.0)), int(min(high, BLOCK - 1.0)) + 1
 
 
 @njit(cache=True)
-def _scan_block(arrays, block, key, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
-    """Improve (best sorted point, squared distance) by the points of one block."""
-    points, geometry, start = arrays.points, arrays.geometry, arrays.voxel_start
-    inverse = geometry[4]
-    radius = np.sqrt(best2) * (1.0 + 1e-9) + 1e-12
-    mask = (1 << AXIS_BITS) - 1
-    i0, i1 = _voxel_range(x, radius, geometry[0], inverse, (key >> (2 * AXIS_BITS)) * BLOCK)
-    j0, j1 = _voxel_range(y, radius, geometry[1], inverse, ((key >> AXIS_BITS) & mask) * BLOCK)
-    k0, k1 = _voxel_range(z, radius, geometry[2], inverse, (key & mask) * BLOCK)
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            for k in range(k0, k1):
-                voxel = block * BLOCK_VOXELS + _voxel_in_block(i, j, k)
-                for p in range(start[voxel], start[voxel + 1]):
-                    ex, ey, ez = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                    d2 = ex * ex + ey * ey + ez * ez
-                    if d2 < best2 and (min_cos <= -1.0 or _faces(normals, arrays.order[p], dx, dy, dz, min_cos)):
-                        best, best2 = p, d2
-    return best, best2
+def _voxels_in_ball(arrays, key, x, y, z, radius):
+    """Half-open ranges of a block's voxels, per axis, that the ball's bounding box covers."""
+    inverse = arrays.inverse_voxel
+    i0, i1 = _voxel_range(x - arrays.x0, radius, inverse, (key >> (2 * AXIS_BITS)) * BLOCK)
+    j0, j1 = _voxel_range(y - arrays.y0, radius, inverse, ((key >> AXIS_BITS) & AXIS_MASK) * BLOCK)
+    k0, k1 = _voxel_range(z - arrays.z0, radius, inverse, (key & AXIS_MASK) * BLOCK)
+    return i0, i1, j0, j1, k0, k1
+
+
+@njit(cache=True, inline="always")
+def _distance2(points, p, x, y, z):
+    ex, ey, ez = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+    return ex * ex + ey * ey + ez * ez
 
 
 @njit(cache=True, inline="always")
@@ -185,31 +179,46 @@ def _faces(normals, p, dx, dy, dz, min_cos):
 
 
 @njit(cache=True)
-def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
-    """Improve (best sorted point, squared distance) by every block nearer than that, in shells outward."""
-    geometry, slots, blocks = arrays.geometry, arrays.block_slots, arrays.blocks
-    edge = geometry[3] * BLOCK
-    ci = np.int64(np.floor((x - geometry[0]) / edge))
-    cj = np.int64(np.floor((y - geometry[1]) / edge))
-    ck = np.int64(np.floor((z - geometry[2]) / edge))
-    first = max(-ci, ci - blocks[0] + 1, -cj, cj - blocks[1] + 1, -ck, ck - blocks[2] + 1, 0)
-    last = max(ci, blocks[0] - 1 - ci, cj, blocks[1] - 1 - cj, ck, blocks[2] - 1 - ck)
+def _scan_block(arrays, block, key, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
+    """Improve (best sorted point, squared distance) by the points of one block."""
+    points, start = arrays.points, arrays.voxel_start
+    i0, i1, j0, j1, k0, k1 = _voxels_in_ball(arrays, key, x, y, z, np.sqrt(best2))
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            for k in range(k0, k1):
+                voxel = block * BLOCK_VOXELS + _voxel_in_block(i, j, k)
+                for p in range(start[voxel], start[voxel + 1]):
+                    d2 = _distance2(points, p, x, y, z)
+                    if d2 < best2 and (min_cos <= -1.0 or _faces(normals, int(points[p, 3]), dx, dy, dz, min_cos)):
+                        best, best2 = p, d2
+    return best, best2
+
+
+@njit(cache=True)
+def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2):
+    """(best sorted point or -1, squared distance) of all blocks nearer than sqrt(best2), in shells outward.
+    With min_cos = -1 every point counts and `normals` is not read."""
+    slots, best = arrays.block_slots, -1
+    nx, ny, nz = arrays.blocks_x, arrays.blocks_y, arrays.blocks_z
+    edge = arrays.voxel * BLOCK
+    ci = int(np.floor((x - arrays.x0) / edge))
+    cj = int(np.floor((y - arrays.y0) / edge))
+    ck = int(np.floor((z - arrays.z0) / edge))
+    first = max(-ci, ci - nx + 1, -cj, cj - ny + 1, -ck, ck - nz + 1, 0)
+    last = max(ci, nx - 1 - ci, cj, ny - 1 - cj, ck, nz - 1 - ck)
     for shell in range(first, last + 1):
         if shell > 1 and ((shell - 1) * edge) ** 2 * (1.0 - 1e-9) > best2:
             break
-        if (2 * shell + 1) ** 2 > arrays.block_keys.shape[0] and shell > 2:
+        if shell > 2 and (2 * shell + 1) ** 2 > slots.shape[0]:
             return _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
-        for i in range(max(ci - shell, 0), min(ci + shell + 1, blocks[0])):
-            for j in range(max(cj - shell, 0), min(cj + shell + 1, blocks[1])):
+        for i in range(max(ci - shell, 0), min(ci + shell + 1, nx)):
+            for j in range(max(cj - shell, 0), min(cj + shell + 1, ny)):
                 on_side = abs(i - ci) == shell or abs(j - cj) == shell
-                step = 1 if on_side or shell == 0 else 2 * shell
-                for k in range(ck - shell, ck + shell + 1, step):
-                    if k < 0 or k >= blocks[2]:
-                        continue
+                for k in range(ck - shell, ck + shell + 1, 1 if on_side else 2 * shell):
                     key = _pack(i, j, k)
-                    if _block_distance2(arrays, key, x, y, z) >= best2:
+                    if k < 0 or k >= nz or _block_distance2(arrays, key, x, y, z) >= best2:
                         continue
-                    row = _find_slot(slots, key)
+                    row = _find_slot(slots, key, slots.shape[0] - 1)
                     if slots[row, 0] == key:
                         best, best2 = _scan_block(
                             arrays, slots[row, 1], key, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
@@ -218,150 +227,155 @@ def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
 
 @njit(cache=True)
 def _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
-    """As `_search`, over the list of blocks: cheaper than empty space once that is the larger of the two."""
-    for block in range(arrays.block_keys.shape[0]):
-        key = arrays.block_keys[block]
-        if _block_distance2(arrays, key, x, y, z) < best2:
-            best, best2 = _scan_block(arrays, block, key, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
+    """Go on with `_search` over the table of blocks: cheaper than empty space once that is the larger of the two."""
+    slots = arrays.block_slots
+    for row in range(slots.shape[0]):
+        key = slots[row, 0]
+        if key >= 0 and _block_distance2(arrays, key, x, y, z) < best2:
+            best, best2 = _scan_block(
+                arrays, slots[row, 1], key, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
     return best, best2
 
 
 @njit(cache=True, inline="always")
-def _never_nearest(arrays, p, other, x, y, z, edge):
-    """Whether sorted point `other` is closer than `p` at every point of the box (centre x, y, z)."""
-    points = arrays.points
-    px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-    ox, oy, oz = points[other, 0], points[other, 1], points[other, 2]
-    p2 = (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2
-    o2 = (ox - x) ** 2 + (oy - y) ** 2 + (oz - z) ** 2
-    swing = edge * (abs(ox - px) + abs(oy - py) + abs(oz - pz))
-    return p2 - o2 - swing > 1e-12 * (p2 + o2)
+def _never_nearest(points, p, pool, other, x, y, z, edge):
+    """Whether `pool[other]` is closer than `points[p]` at every place of the box (centre x, y, z)."""
+    p2 = _distance2(points, p, x, y, z)
+    other2 = _distance2(pool, other, x, y, z)
+    swing = edge * (abs(pool[other, 0] - points[p, 0]) + abs(pool[other, 1] - points[p, 1])
+                    + abs(pool[other, 2] - points[p, 2]))
+    return p2 - other2 - swing > 1e-12 * (p2 + other2)
 
 
 @njit(cache=True)
-def _gather(arrays, x, y, z, radius, centre_nearest, edge):
-    """Write to the end of the pool the points within `radius` that `centre_nearest` does not rule out; how many
-    (GATHER_LIMIT + 1 when there are more)."""
-    points, geometry, slots, blocks = arrays.points, arrays.geometry, arrays.block_slots, arrays.blocks
-    start = arrays.voxel_start
-    block_edge, used, count = geometry[3] * BLOCK, arrays.state[1], 0
-    radius2 = radius * radius
-    for i in range(max(np.int64(np.floor((x - radius - geometry[0]) / block_edge)), 0),
-                   min(np.int64(np.floor((x + radius - geometry[0]) / block_edge)) + 1, blocks[0])):
-        for j in range(max(np.int64(np.floor((y - radius - geometry[1]) / block_edge)), 0),
-                       min(np.int64(np.floor((y + radius - geometry[1]) / block_edge)) + 1, blocks[1])):
-            for k in range(max(np.int64(np.floor((z - radius - geometry[2]) / block_edge)), 0),
-                           min(np.int64(np.floor((z + radius - geometry[2]) / block_edge)) + 1, blocks[2])):
+def _gather(arrays, x, y, z, radius, used):
+    """Write to the pool, after row `used`, the points within `radius` that row `used` does not rule out (row `used`
+    itself is among them, so it is written twice and the first one dropped by the caller). The end of what was
+    written, or -1 when there are more than GATHER_LIMIT."""
+    slots, end = arrays.block_slots, used + 1
+    edge = arrays.voxel * BLOCK
+    for i in range(max(int(np.floor((x - radius - arrays.x0) / edge)), 0),
+                   min(int(np.floor((x + radius - arrays.x0) / edge)) + 1, arrays.blocks_x)):
+        for j in range(max(int(np.floor((y - radius - arrays.y0) / edge)), 0),
+                       min(int(np.floor((y + radius - arrays.y0) / edge)) + 1, arrays.blocks_y)):
+            for k in range(max(int(np.floor((z - radius - arrays.z0) / edge)), 0),
+                           min(int(np.floor((z + radius - arrays.z0) / edge)) + 1, arrays.blocks_z)):
                 key = _pack(i, j, k)
-                if _block_distance2(arrays, key, x, y, z) > radius2:
+                if _block_distance2(arrays, key, x, y, z) > radius * radius:
                     continue
-                row = _find_slot(slots, key)
-                if slots[row, 0] != key:
-                    continue
-                block = slots[row, 1]
-                for p in range(start[block * BLOCK_VOXELS], start[(block + 1) * BLOCK_VOXELS]):
-                    d2 = (points[p, 0] - x) ** 2 + (points[p, 1] - y) ** 2 + (points[p, 2] - z) ** 2
-                    if d2 > radius2 or _never_nearest(arrays, p, centre_nearest, x, y, z, edge):
-                        continue
-                    if count == GATHER_LIMIT:
-                        return GATHER_LIMIT + 1
-                    arrays.pool[used + count] = p
-                    count += 1
-    return count
+                row = _find_slot(slots, key, slots.shape[0] - 1)
+                if slots[row, 0] == key:
+                    end = _gather_block(arrays, slots[row, 1], key, x, y, z, radius, used, end)
+                    if end < 0:
+                        return end
+    return end
 
 
 @njit(cache=True)
-def _prune(arrays, x, y, z, edge, count):
-    """Drop from the gathered candidates those ruled out by the point nearest to one of the box's corners."""
-    points, pool, used = arrays.points, arrays.pool, arrays.state[1]
+def _gather_block(arrays, block, key, x, y, z, radius, used, end):
+    points, pool, start, edge = arrays.points, arrays.pool, arrays.voxel_start, arrays.voxel
+    i0, i1, j0, j1, k0, k1 = _voxels_in_ball(arrays, key, x, y, z, radius)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            for k in range(k0, k1):
+                voxel = block * BLOCK_VOXELS + _voxel_in_block(i, j, k)
+                for p in range(start[voxel], start[voxel + 1]):
+                    if _never_nearest(points, p, pool, used, x, y, z, edge):
+                        continue
+                    if end - used > GATHER_LIMIT:
+                        return -1
+                    pool[end] = points[p]
+                    end += 1
+    return end
+
+
+@njit(cache=True)
+def _prune(pool, used, end, x, y, z, edge):
+    """Drop from pool rows used..end those ruled out by the one nearest to some corner of the box; the new end."""
     for corner in range(8):
         qx = x + edge * ((corner & 1) - 0.5)
         qy = y + edge * (((corner >> 1) & 1) - 0.5)
         qz = z + edge * (((corner >> 2) & 1) - 0.5)
-        best, best2 = -1, np.inf
-        for c in range(used, used + count):
-            p = pool[c]
-            d2 = (points[p, 0] - qx) ** 2 + (points[p, 1] - qy) ** 2 + (points[p, 2] - qz) ** 2
+        best, best2 = used, np.inf
+        for c in range(used, end):
+            d2 = _distance2(pool, c, qx, qy, qz)
             if d2 < best2:
-                best, best2 = p, d2
-        kept = 0
-        for c in range(used, used + count):
-            if not _never_nearest(arrays, pool[c], best, x, y, z, edge):
-                pool[used + kept] = pool[c]
+                best, best2 = c, d2
+        # The winner goes first, where compaction cannot overwrite it before it has been compared with all others.
+        for column in range(4):
+            pool[used, column], pool[best, column] = pool[best, column], pool[used, column]
+        kept = used + 1
+        for c in range(used + 1, end):
+            if not _never_nearest(pool, c, pool, used, x, y, z, edge):
+                pool[kept] = pool[c]
                 kept += 1
-        count = kept
-    return count
+        end = kept
+    return end
 
 
 @njit(cache=True)
-def _make_list(arrays, x, y, z):
-    """Candidate list of the cell with this centre at the end of the pool: its length, or FAR or CROWDED."""
-    edge, reach = arrays.geometry[3], arrays.geometry[5]
-    half_diagonal = 0.5 * np.sqrt(3.0) * edge
-    limit = reach + half_diagonal
-    best, best2 = _search(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, -1, limit * limit)
+def _make_list(arrays, x, y, z, used):
+    """Write the candidate list of the cell with this centre at pool row `used`: its length, or FAR or CROWDED."""
+    half_diagonal = 0.5 * np.sqrt(3.0) * arrays.voxel
+    limit = arrays.reach + half_diagonal
+    best, best2 = _search(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, limit * limit)
     if best < 0:
         return FAR
     # Every query of the cell has a point within |c - best| + half diagonal of it.
     radius = np.sqrt(best2) + 2.0 * half_diagonal * (1.0 + 1e-9)
-    count = _gather(arrays, x, y, z, radius, best, edge)
-    if count > GATHER_LIMIT:
+    arrays.pool[used] = arrays.points[best]
+    end = _gather(arrays, x, y, z, radius, used)
+    if end < 0:
         return CROWDED
-    count = _prune(arrays, x, y, z, edge, count)
-    return count if count <= LIST_LIMIT else CROWDED
-
-
-@njit(cache=True)
-def _empty_cache(arrays):
-    arrays.cell_slots[:, 0] = -1
-    arrays.state[0] = 0
-    arrays.state[1] = 0
-    arrays.state[3] += 1
+    arrays.pool[used] = arrays.pool[end - 1]  # the second copy of `best` is still among them
+    length = _prune(arrays.pool, used, end - 1, x, y, z, arrays.voxel) - used
+    return length if length <= LIST_LIMIT else CROWDED
 
 
 @njit(cache=True)
 def _add_list(arrays, key):
-    """Make and store the list of a cell not seen before; its packed entry."""
-    state, geometry = arrays.state, arrays.geometry
-    if state[0] * 2 > arrays.cell_slots.shape[0] or state[1] + GATHER_LIMIT > arrays.pool.shape[0]:
-        _empty_cache(arrays)
-    edge = geometry[3]
-    mask = (1 << AXIS_BITS) - 1
-    x = geometry[0] + ((key >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * edge
-    y = geometry[1] + (((key >> AXIS_BITS) & mask) - AXIS_LIMIT + 0.5) * edge
-    z = geometry[2] + ((key & mask) - AXIS_LIMIT + 0.5) * edge
-    count = _make_list(arrays, x, y, z)
-    entry = (state[1] << 16) + count + 2
-    row = _find_slot(arrays.cell_slots, key)
-    arrays.cell_slots[row, 0], arrays.cell_slots[row, 1] = key, entry
-    state[0] += 1
-    state[1] += max(count, 0)
-    state[2] += 1
+    """Make and store the list of a cell not seen before; its packed entry. Empties the cache first when it is full."""
+    slots = arrays.cell_slots
+    table = slots.shape[0] - COUNTERS
+    if slots[table, 0] * 2 > table or slots[table, 1] + GATHER_LIMIT + 2 > arrays.pool.shape[0]:
+        slots[:table, 0] = -1
+        slots[table] = 0
+        slots[table + 1, 1] += 1
+    x = arrays.x0 + ((key >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * arrays.voxel
+    y = arrays.y0 + (((key >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.voxel
+    z = arrays.z0 + ((key & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.voxel
+    start = slots[table, 1]
+    length = _make_list(arrays, x, y, z, start)
+    entry = (start << 16) + length + 2
+    row = _find_slot(slots, key, table - 1)
+    slots[row, 0], slots[row, 1] = key, entry
+    slots[table, 0] += 1
+    slots[table, 1] += max(length, 0)
+    slots[table + 1, 0] += 1
     return entry
 
 
-@njit(cache=True)
-def _cell_key(geometry, x, y, z):
+@njit(cache=True, inline="always")
+def _cell_key(arrays, x, y, z):
     """Key of the cell that holds a place; -1 for nan and for places absurdly far away."""
-    i = np.floor((x - geometry[0]) * geometry[4])
-    j = np.floor((y - geometry[1]) * geometry[4])
-    k = np.floor((z - geometry[2]) * geometry[4])
-    if not (abs(i) < AXIS_LIMIT and abs(j) < AXIS_LIMIT and abs(k) < AXIS_LIMIT):
-        return np.int64(-1)
-    return _pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT)
+    i = np.floor((x - arrays.x0) * arrays.inverse_voxel)
+    j = np.floor((y - arrays.y0) * arrays.inverse_voxel)
+    k = np.floor((z - arrays.z0) * arrays.inverse_voxel)
+    key = np.int64(-1)
+    if abs(i) < AXIS_LIMIT and abs(j) < AXIS_LIMIT and abs(k) < AXIS_LIMIT:
+        key = _pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT)
+    return key
 
 
 @njit(cache=True)
-def _nearest_listed(points, pool, entry, x, y, z, limit2):
-    """Nearest of a cell's candidates (sorted point or -1, squared distance)."""
+def _nearest_listed(pool, entry, x, y, z, limit2):
+    """Nearest of a cell's candidates: (pool row or -1, squared distance)."""
     best, best2 = -1, limit2
     start = entry >> 16
     for c in range(start, start + (entry & 0xFFFF) - 2):
-        p = pool[c]
-        ex, ey, ez = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-        d2 = ex * ex + ey * ey + ez * ez
+        d2 = _distance2(pool, c, x, y, z)
         if d2 < best2:
-            best, best2 = p, d2
+            best, best2 = c, d2
     return best, best2
 
 
@@ -369,32 +383,42 @@ def _nearest_listed(points, pool, entry, x, y, z, limit2):
 def _nearest_unlisted(arrays, key, row, x, y, z, max_distance):
     """`nearest` where the cell has no usable list yet: make one, or search where none can be made."""
     entry = arrays.cell_slots[row, 1] if arrays.cell_slots[row, 0] == key else _add_list(arrays, key)
-    count = (entry & 0xFFFF) - 2
-    if count == CROWDED or (count == FAR and max_distance > arrays.geometry[5]):
-        return _search(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, -1, max_distance * max_distance)
-    return _nearest_listed(arrays.points, arrays.pool, entry, x, y, z, max_distance * max_distance)
+    length = (entry & 0xFFFF) - 2
+    if length >= 0:
+        best, best2 = _nearest_listed(arrays.pool, entry, x, y, z, max_distance * max_distance)
+        return (np.int64(arrays.pool[best, 3]), best2) if best >= 0 else (np.int64(-1), np.inf)
+    if length == FAR and max_distance <= arrays.reach:
+        return np.int64(-1), np.inf
+    return _nearest_searched(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, max_distance * max_distance)
 
 
-# The next two are inlined into their callers: handing the arrays over costs more than the lookup itself.
-@njit(cache=True, inline="always")
+@njit(cache=True)
+def _nearest_searched(arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2):
+    best, best2 = _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2)
+    if best < 0:
+        return np.int64(-1), np.inf
+    return np.int64(arrays.points[best, 3]), best2
+
+
+@njit(cache=True)
 def nearest(arrays, x, y, z, max_distance):
     """(row of the nearest point in the caller's cloud, squared distance [m^2]), or (-1, inf) when none lies
     strictly within `max_distance` [m] or the query is not finite."""
     index, distance2 = np.int64(-1), np.inf
-    key = _cell_key(arrays.geometry, x, y, z)
+    key = _cell_key(arrays, x, y, z)
     if key >= 0:
-        row = _find_slot(arrays.cell_slots, key)
-        if arrays.cell_slots[row, 0] == key and (arrays.cell_slots[row, 1] & 0xFFFF) > 1:
-            best, best2 = _nearest_listed(
-                arrays.points, arrays.pool, arrays.cell_slots[row, 1], x, y, z, max_distance * max_distance)
+        slots = arrays.cell_slots
+        row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
+        if slots[row, 0] == key and (slots[row, 1] & 0xFFFF) >= 2:
+            best, best2 = _nearest_listed(arrays.pool, slots[row, 1], x, y, z, max_distance * max_distance)
+            if best >= 0:
+                index, distance2 = np.int64(arrays.pool[best, 3]), best2
         else:
-            best, best2 = _nearest_unlisted(arrays, key, row, x, y, z, max_distance)
-        if best >= 0:
-            index, distance2 = np.int64(arrays.order[best]), best2
+            index, distance2 = _nearest_unlisted(arrays, key, row, x, y, z, max_distance)
     return index, distance2
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
     """As `nearest`, among the points whose outward normal n has -(n . d) >= min_cos.
 
@@ -411,20 +435,17 @@ def nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
 def _search_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
     """`nearest_facing` where the nearest point does not face: the facing ones among the cell's candidates bound the
     distance, and the grid is searched within that."""
-    best, best2 = -1, max_distance * max_distance
-    row = _find_slot(arrays.cell_slots, _cell_key(arrays.geometry, x, y, z))
-    entry = arrays.cell_slots[row, 1]
-    points, pool, order = arrays.points, arrays.pool, arrays.order
+    slots, pool = arrays.cell_slots, arrays.pool
+    best, best2 = np.int64(-1), max_distance * max_distance
+    entry = slots[_find_slot(slots, _cell_key(arrays, x, y, z), slots.shape[0] - COUNTERS - 1), 1]
     for c in range(entry >> 16, (entry >> 16) + max((entry & 0xFFFF) - 2, 0)):
-        p = pool[c]
-        ex, ey, ez = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-        d2 = ex * ex + ey * ey + ez * ez
-        if d2 < best2 and _faces(normals, order[p], dx, dy, dz, min_cos):
-            best, best2 = p, d2
-    best, best2 = _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
-    if best < 0:
-        return np.int64(-1), np.inf
-    return np.int64(order[best]), best2
+        d2 = _distance2(pool, c, x, y, z)
+        if d2 < best2 and _faces(normals, int(pool[c, 3]), dx, dy, dz, min_cos):
+            best, best2 = np.int64(pool[c, 3]), d2
+    index, distance2 = _nearest_searched(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2)
+    if index < 0 and best >= 0:
+        index, distance2 = best, best2
+    return index, distance2
 
 
 @njit(cache=True)
@@ -445,13 +466,13 @@ class VoxelIndex:
     """Nearest-neighbour index of a fixed cloud; see the module's docstring for how it works.
 
     points: (P, 3) [m], finite, P >= 1. normals: (P, 3) unit, needed for `nearest_facing`.
-    voxel: edge of a voxel [m], by default so that an occupied one holds about ten points.
+    voxel: edge of a voxel [m], by default so that an occupied one holds about three points.
     reach: largest distance [m] that is served at full speed; larger ones are exact too, but searched for.
-    cache_cells: candidate lists kept at a time (about 150 bytes each).
+    cache_cells: candidate lists kept at a time (about 0.5 kB each).
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray | None = None, voxel: float | None = None,
-                 reach: float = 0.1, cache_cells: int = 1 << 18):
+                 reach: float = 0.1, cache_cells: int = 1 << 17):
         points = _checked_rows(points, "points")
         self.normals = points if normals is None else _checked_rows(normals, "normals")
         if self.normals.shape != points.shape:
@@ -460,16 +481,22 @@ class VoxelIndex:
         self.voxel = float(voxel) if voxel is not None else _suitable_voxel(points)
         if not self.voxel > 0.0 or not reach >= 0.0:
             raise MapError(f"voxel must be > 0 and reach >= 0, got voxel {voxel!r}, reach {reach!r}")
-        self.arrays = _build(points, self.voxel, float(reach), int(cache_cells))
+        self._cache_cells = int(cache_cells)
+        self.arrays = _build(points, self.voxel, float(reach), self._cache_cells)
 
     def copy(self) -> VoxelIndex:
         """An index of the same cloud with a cache of its own (for another thread)."""
         twin = object.__new__(VoxelIndex)
         twin.__dict__.update(self.__dict__)
-        twin.arrays = self.arrays._replace(
-            cell_slots=np.full_like(self.arrays.cell_slots, -1), pool=np.empty_like(self.arrays.pool),
-            state=np.zeros_like(self.arrays.state))
+        cell_slots, pool = _empty_cache(self._cache_cells)
+        twin.arrays = self.arrays._replace(cell_slots=cell_slots, pool=pool)
         return twin
+
+    @property
+    def cache_use(self) -> dict[str, int]:
+        """Counts: `cells` with a list now, `candidates` in them, `made` lists since the start, times `emptied`."""
+        counters = self.arrays.cell_slots[-COUNTERS:].ravel()
+        return dict(zip(("cells", "candidates", "made", "emptied"), map(int, counters), strict=True))
 
     def nearest(self, queries: np.ndarray, max_distance: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
         """Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3); -1 and inf where none."""
@@ -518,26 +545,29 @@ def _suitable_voxel(points: np.ndarray) -> float:
 
 
 def _build(points: np.ndarray, voxel: float, reach: float, cache_cells: int) -> VoxelArrays:
-    origin = points.min(axis=0)
-    extent = np.floor((points.max(axis=0) - origin) / voxel).astype(np.int64)
-    if extent.max() >= AXIS_LIMIT // 2:
+    origin, inverse = points.min(axis=0), 1.0 / voxel
+    extent = np.floor((points.max(axis=0) - origin) * inverse).astype(np.int64)
+    if extent.max() >= AXIS_LIMIT:
         raise MapError(f"voxel {voxel} m is too small for a cloud {np.ptp(points, axis=0).max():.6g} m across; "
-                       f"at most {AXIS_LIMIT // 2} voxels fit along an axis")
-    codes = _morton_codes(points, origin, 1.0 / voxel)
+                       f"at most {AXIS_LIMIT} voxels fit along an axis")
+    codes = _morton_codes(points, origin, inverse)
     order = np.argsort(codes, kind="stable")
-    codes, points = codes[order], points[order]
+    codes, points = codes[order], np.column_stack([points[order], order.astype(np.float64)])
+    block = np.floor((points[:, :3] - origin) * inverse).astype(np.int64) // BLOCK
+    keys = (block[:, 0] << (2 * AXIS_BITS)) | (block[:, 1] << AXIS_BITS) | block[:, 2]
     count = 1 + int(np.count_nonzero(np.diff(codes >> 6)))
     block_slots = np.full((_power_of_two(4 * count), 2), -1, np.int64)
-    block_keys = np.empty(count, np.int64)
-    voxel_start = np.empty(count * BLOCK_VOXELS + 1, np.int32 if len(points) < 2**31 else np.int64)
-    _fill_blocks(points, codes, origin, 1.0 / voxel, block_slots, block_keys, voxel_start)
-    return VoxelArrays(
-        points=points, order=order.astype(np.int32 if len(points) < 2**31 else np.int64),
-        geometry=np.array([*origin, voxel, 1.0 / voxel, reach]),
-        blocks=np.floor((points.max(axis=0) - origin) * (1.0 / voxel)).astype(np.int64) // BLOCK + 1,
-        block_slots=block_slots, block_keys=block_keys, voxel_start=voxel_start,
-        cell_slots=np.full((_power_of_two(2 * cache_cells), 2), -1, np.int64),
-        pool=np.empty(32 * cache_cells + 2 * GATHER_LIMIT, np.int32), state=np.zeros(4, np.int64))
+    voxel_start = np.empty(count * BLOCK_VOXELS + 1, np.int64)
+    _fill_blocks(codes, keys, block_slots, voxel_start)
+    return VoxelArrays(points, block_slots, voxel_start, *_empty_cache(cache_cells), *map(float, origin), voxel,
+                       inverse, *map(int, extent // BLOCK + 1), reach)
+
+
+def _empty_cache(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tables for that many candidate lists; the memory of the pool is taken only as it fills."""
+    cell_slots = np.full((_power_of_two(2 * cells) + COUNTERS, 2), -1, np.int64)
+    cell_slots[-COUNTERS:] = 0
+    return cell_slots, np.empty((20 * cells + 2 * GATHER_LIMIT, 4))
 
 
 def spatial_order(points: np.ndarray, voxel: float) -> np.ndarray:
