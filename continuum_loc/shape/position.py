@@ -85,7 +85,7 @@ class PositionSolver:
         """(M, 6, 6) covariance of position and attitude errors in the magnet's frame, and observability (M,).
 
         sigma: white noise of the field [T]; attitude (M, 3, 3): covariance of the module's rotation error phi in
-        the magnet's frame [rad^2], which turns the measured field: db = -b x phi. The prior that a module lies
+        the magnet's frame [rad^2], which turns the measured field: db = phi x b. The prior that a module lies
         within its arclength (one sigma of half of it) keeps the result finite where the field says nothing;
         `observable` is whether the field narrows that prior at least fivefold in every direction.
         """
@@ -96,7 +96,7 @@ class PositionSolver:
         weighted = np.linalg.solve(noise, gradient).swapaxes(1, 2)  # B'^T noise^-1
         information = weighted @ gradient + np.eye(3) / prior_sigma[:, None, None]**2
         P = np.linalg.inv(information)
-        cross = -P @ weighted @ turn @ attitude  # a turned field moves the solution
+        cross = P @ weighted @ turn @ attitude  # a turned field moves the solution
         covariance = np.block([[P, cross], [cross.swapaxes(1, 2), attitude]])
         return covariance, np.sqrt(np.linalg.eigvalsh(P)[:, -1]) < 0.2 * prior_sigma
 
