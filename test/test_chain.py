@@ -36,11 +36,10 @@ def test_solution_and_covariances_equal_dense_algebra(seed):
     chain = Chain(D, start)
     np.testing.assert_allclose(np.concatenate(chain.solve(intervals, 0)), np.linalg.solve(H, -g), atol=1e-9)
     P = np.linalg.inv(H)
-    marginals, crosses = chain.covariances(K)
-    for k in range(K):
-        np.testing.assert_allclose(marginals[k], P[D * k:D * (k + 1), D * k:D * (k + 1)], atol=1e-9)
+    rows = np.array([1, 4, 5])
     for k in range(K - 1):
-        np.testing.assert_allclose(crosses[k], P[D * k:D * (k + 1), D * (k + 1):D * (k + 2)], atol=1e-9)
+        chosen = np.concatenate([D * k + rows, D * (k + 1) + rows])
+        np.testing.assert_allclose(chain.joint_covariance(k, rows), P[np.ix_(chosen, chosen)], atol=1e-9)
 
 
 def test_marginalising_equals_the_batch_solution():
@@ -53,7 +52,7 @@ def test_marginalising_equals_the_batch_solution():
         window.append(block)
         offsets = chain.solve(window, len(window) - 1)
         if len(window) == 3:
-            chain.forget_oldest()
+            chain.forget_oldest(window[0], changed=False)
             del window[0]
     np.testing.assert_allclose(offsets[-1], batch[-D:], atol=1e-9)
 

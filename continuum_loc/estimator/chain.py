@@ -7,8 +7,8 @@ a *message* (Lambda, eta), all that the past says of it:
     S_k = Lambda_k + H_aa,   Lambda_k+1 = H_bb - H_ab^T S_k^-1 H_ab,   eta_k+1 = g_b - H_ab^T S_k^-1 (eta_k + g_a).
 
 Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the message it left.
-Messages before the first interval that changed are kept from the last solve. Covariances come by the recursion
-P_k = S_k^-1 + G_k P_k+1 G_k^T, G_k = S_k^-1 H_ab; no matrix is inverted but the newest one.
+Messages before the first interval that changed are kept from the last solve, and covariances come from the same
+triangular factors; no matrix is ever inverted.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.linalg import blas, lapack
 
 
@@ -81,39 +82,55 @@ class Chain:
             offsets.append(-_solve_upper(step.L, step.y + step.Y @ offsets[-1]))
         return offsets[::-1]
 
-    def covariances(self, count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Marginal covariances (D, D) of the newest `count` columns, oldest of them first, and the `count - 1`
-        cross covariances of each with the next."""
-        marginals, crosses = [_inverse(self._last[0])], []
-        for step in reversed(self._eliminated[len(self._eliminated) - (count - 1):] if count > 1 else []):
-            G = blas.dtrsm(1.0, step.L, step.Y, lower=1, trans_a=1)
-            GP = G @ marginals[-1]
-            crosses.append(-GP)
-            marginals.append(_inverse(step.L) + GP @ G.T)
-        return marginals[::-1], crosses[::-1]
+    def joint_covariance(self, column: int, rows: np.ndarray) -> np.ndarray:
+        """Covariance (2 m, 2 m) of `rows` (m,) of a column and of the same rows of the next.
 
-    def forget_oldest(self) -> None:
-        """Marginalise the oldest column: its message to the next becomes the start."""
-        if not self._eliminated:
-            raise SingularError(0)
+        With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 E, and X is zero above `column`: the cost
+        grows with the columns after it, not with the window.
+        """
+        m, D = len(rows), self.dim
+        E = np.zeros((D, 2 * m), order="F")
+        E[rows, np.arange(m)] = 1.0
+        X = blas.dtrsm(1.0, self._factor(column), E, lower=1)
+        covariance = blas.dsyrk(1.0, X, trans=1, lower=1)
+        for k in range(column + 1, len(self._eliminated) + 1):
+            right = -(self._eliminated[k - 1].Y.T @ X)
+            if k == column + 1:
+                right[rows, m + np.arange(m)] += 1.0
+            X = blas.dtrsm(1.0, self._factor(k), np.asfortranarray(right), lower=1)
+            covariance = blas.dsyrk(1.0, X, beta=1.0, c=covariance, trans=1, lower=1, overwrite_c=1)
+        return _symmetrised(covariance)
+
+    def _factor(self, column: int) -> np.ndarray:
+        return self._eliminated[column].L if column < len(self._eliminated) else self._last[0]
+
+    def forget_oldest(self, oldest: Blocks, changed: bool) -> None:
+        """Marginalise the oldest column through its interval: its message to the next becomes the start.
+
+        `changed` says that the interval is not the one of the last solve, so that it must be eliminated anew.
+        """
+        if changed or not self._eliminated:
+            self.messages[1:], self._eliminated[:] = [], []
+            self._eliminate(oldest, 0, 0.0)
         del self.messages[0], self._eliminated[0]
 
     def _forward(self, intervals: list[Blocks], first: int, damping: float) -> None:
-        D = self.dim
         first = min(first, len(self._eliminated))
         del self.messages[first + 1:], self._eliminated[first:]
         for k in range(first, len(intervals)):
-            H, g, message = intervals[k].H, intervals[k].g, self.messages[k]
-            L = _cholesky(message.information + H[:D, :D], damping, k)
-            Y = blas.dtrsm(1.0, L, H[:D, D:], lower=1)
-            y = _solve_lower(L, message.gradient + g[:D])
-            information = np.asfortranarray(H[D:, D:])
-            information = blas.dsyrk(-1.0, Y, beta=1.0, c=information, trans=1, lower=1)
-            self._eliminated.append(_Elimination(L, Y, y))
-            self.messages.append(Message(_symmetrised(information), g[D:] - Y.T @ y))
+            self._eliminate(intervals[k], k, damping)
         newest = self.messages[-1]
         L = _cholesky(newest.information, damping, len(intervals))
         self._last = (L, _solve_lower(L, newest.gradient))
+
+    def _eliminate(self, interval: Blocks, k: int, damping: float) -> None:
+        D, H, g, message = self.dim, interval.H, interval.g, self.messages[k]
+        L = _cholesky(message.information + H[:D, :D], damping, k)
+        Y = blas.dtrsm(1.0, L, H[D:, :D].T, lower=1)
+        y = _solve_lower(L, message.gradient + g[:D])
+        information = blas.dsyrk(-1.0, Y, beta=1.0, c=H[D:, D:].T, trans=1, lower=1)
+        self._eliminated.append(_Elimination(L, Y, y))
+        self.messages.append(Message(_symmetrised(information), g[D:] - Y.T @ y))
 
 
 def _cholesky(S: np.ndarray, damping: float, column: int) -> np.ndarray:
@@ -127,9 +144,16 @@ def _cholesky(S: np.ndarray, damping: float, column: int) -> np.ndarray:
 
 def _symmetrised(lower: np.ndarray) -> np.ndarray:
     """The full matrix of one whose lower triangle alone was updated."""
-    out = np.tril(lower)
-    out += np.tril(lower, -1).T
-    return out
+    _mirror(lower)
+    return lower
+
+
+@njit(cache=True)
+def _mirror(matrix):
+    """Copy the lower triangle onto the upper one, in place."""
+    for j in range(matrix.shape[1]):
+        for i in range(j):
+            matrix[i, j] = matrix[j, i]
 
 
 def _solve_lower(L: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -138,9 +162,3 @@ def _solve_lower(L: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _solve_upper(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     return blas.dtrsv(L, b, lower=1, trans=1)
-
-
-def _inverse(L: np.ndarray) -> np.ndarray:
-    """(L L^T)^-1, full."""
-    inverse, _ = lapack.dpotri(L, lower=1)
-    return _symmetrised(inverse)

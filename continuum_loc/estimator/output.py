@@ -9,81 +9,62 @@ from numba import njit
 
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.state import NODE_DIM, POSE, STRAIN, VELOCITY, Column, Grid
+from continuum_loc.estimator.state import Column, Grid
+
+
+MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """All nodes at one instant: T (N, 4, 4), strain and velocity (N, 6), and the joint covariance of the column's
-    node part, (N, 18, 18) each node's own in [pose, strain, velocity] order."""
+    """All nodes at one instant: T (N, 4, 4), strain and velocity (N, 6)."""
 
     T: np.ndarray
     strain: np.ndarray
     velocity: np.ndarray
-    covariance: np.ndarray
 
 
-def body_between(a: Column, b: Column, P_a: np.ndarray, P_ab: np.ndarray, P_b: np.ndarray, time: float,
-                 velocity_psd: np.ndarray, strain_psd: np.ndarray) -> Body:
-    """The body at `time` between two columns, whose covariances (D, D) are P_a, P_b and cross covariance P_ab.
+def body_between(a: Column, b: Column, time: float) -> Body:
+    """The body at `time` between two columns: pose and velocity by the Gaussian process's cubic Hermite, strain
+    linearly."""
+    nodes, d = len(a.T), b.time - a.time
+    T, velocity = np.empty((nodes, 4, 4)), np.empty((nodes, 6))
+    _interpolate(a.T, a.velocity, b.T, b.velocity, d, np.full(nodes, time - a.time), np.arange(nodes),
+                 np.arange(nodes), T, velocity, np.empty((0, 6, 24)), np.empty((0, 6, 24)))
+    u = (time - a.time) / d
+    return Body(T, (1.0 - u) * a.strain + u * b.strain, velocity)
 
-    Pose and velocity are the Gaussian process's cubic Hermite, strain its linear interpolation; the covariance
-    includes the bridge that the two ends leave open.
+
+def motion_covariance(a: Column, b: Column, time: float, nodes: np.ndarray, P: np.ndarray,
+                      velocity_psd: np.ndarray) -> np.ndarray:
+    """Covariance (m, 12, 12) of [pose, velocity] of `nodes` (m,) at `time` between two columns.
+
+    P (24 m, 24 m) is the joint covariance of the nodes' MOTION rows in a and then in b. The bridge that the two ends
+    leave open is added.
     """
-    nodes = len(a.T)
-    T, strain, velocity = np.empty((nodes, 4, 4)), np.empty((nodes, 6)), np.empty((nodes, 6))
-    covariance = np.zeros((nodes, NODE_DIM, NODE_DIM))
-    _between(a.T, a.strain, a.velocity, b.T, b.strain, b.velocity, P_a, P_ab, P_b, time - a.time, b.time - a.time,
-             velocity_psd, strain_psd, T, strain, velocity, covariance)
-    return Body(T, strain, velocity, covariance)
-
-
-def body_at(column: Column, P: np.ndarray) -> Body:
-    """The body at a knot itself."""
-    blocks = [P[NODE_DIM * n:NODE_DIM * (n + 1), NODE_DIM * n:NODE_DIM * (n + 1)] for n in range(len(column.T))]
-    return Body(column.T, column.strain, column.velocity, np.array(blocks))
+    m, d, tau = len(nodes), b.time - a.time, time - a.time
+    J = np.empty((m, 12, 24))
+    _interpolate(a.T, a.velocity, b.T, b.velocity, d, np.full(m, tau), nodes, nodes, np.empty((m, 4, 4)),
+                 np.empty((m, 6)), J[:, :6], J[:, 6:])
+    blocks = P.reshape(2, m, 12, 2, m, 12)[:, np.arange(m), :, :, np.arange(m)]  # (m, 2, 12, 2, 12)
+    out = J @ blocks.reshape(m, 24, 24) @ np.swapaxes(J, 1, 2)
+    open_bridge = np.empty((2, 2))
+    gp.bridge(tau, d, open_bridge)
+    return out + np.kron(open_bridge, np.diag(velocity_psd))
 
 
 @njit(cache=True)
-def _between(T_a, eps_a, v_a, T_b, eps_b, v_b, P_a, P_ab, P_b, tau, d, velocity_psd, strain_psd, T, strain, velocity,
-             covariance):
+def _interpolate(T_a, v_a, T_b, v_b, d, tau, from_a, from_b, T, v, J_pose, J_rate):
+    """`gp.hermite` for many: element m goes from T_a[from_a[m]] to T_b[from_b[m]] at tau[m]; the Jacobians are
+    written where J_pose has room."""
     W, V, M = lie_kernels.workspace()
-    J_work = np.empty((2, 6, 24))
-    J = np.zeros((NODE_DIM, 2 * NODE_DIM))
-    J_pose, J_rate = np.empty((6, 24)), np.empty((6, 24))
-    P = np.empty((2 * NODE_DIM, 2 * NODE_DIM))
-    open_bridge = np.empty((2, 2))
-    gp.bridge(tau, d, open_bridge)
-    u = tau / d
-    for n in range(T_a.shape[0]):
-        gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], d, tau, T[n], velocity[n], J_pose, J_rate, W, V, M, J_work)
-        at = NODE_DIM * n
-        for i in range(NODE_DIM):
-            for j in range(NODE_DIM):
-                P[i, j] = P_a[at + i, at + j]
-                P[NODE_DIM + i, NODE_DIM + j] = P_b[at + i, at + j]
-                P[i, NODE_DIM + j] = P_ab[at + i, at + j]
-                P[NODE_DIM + j, i] = P_ab[at + i, at + j]
-        for i in range(6):
-            strain[n, i] = (1.0 - u) * eps_a[n, i] + u * eps_b[n, i]
-            J[STRAIN + i, STRAIN + i] = 1.0 - u
-            J[STRAIN + i, NODE_DIM + STRAIN + i] = u
-            for j in range(6):
-                J[POSE + i, POSE + j] = J_pose[i, j]
-                J[POSE + i, VELOCITY + j] = J_pose[i, 6 + j]
-                J[POSE + i, NODE_DIM + POSE + j] = J_pose[i, 12 + j]
-                J[POSE + i, NODE_DIM + VELOCITY + j] = J_pose[i, 18 + j]
-                J[VELOCITY + i, POSE + j] = J_rate[i, j]
-                J[VELOCITY + i, VELOCITY + j] = J_rate[i, 6 + j]
-                J[VELOCITY + i, NODE_DIM + POSE + j] = J_rate[i, 12 + j]
-                J[VELOCITY + i, NODE_DIM + VELOCITY + j] = J_rate[i, 18 + j]
-        covariance[n] = J @ P @ J.T
-        for i in range(6):
-            covariance[n, POSE + i, POSE + i] += open_bridge[0, 0] * velocity_psd[i]
-            covariance[n, VELOCITY + i, VELOCITY + i] += open_bridge[1, 1] * velocity_psd[i]
-            covariance[n, POSE + i, VELOCITY + i] += open_bridge[0, 1] * velocity_psd[i]
-            covariance[n, VELOCITY + i, POSE + i] += open_bridge[0, 1] * velocity_psd[i]
-            covariance[n, STRAIN + i, STRAIN + i] += u * (1.0 - u) * d * strain_psd[i]
+    J_work, pose, rate = np.empty((2, 6, 24)), np.empty((6, 24)), np.empty((6, 24))
+    for m in range(tau.shape[0]):
+        a, b = from_a[m], from_b[m]
+        gp.hermite(T_a[a], v_a[a], T_b[b], v_b[b], d, tau[m], T[m], v[m], pose, rate, W, V, M, J_work)
+        if m < J_pose.shape[0]:
+            J_pose[m] = pose
+            J_rate[m] = rate
 
 
 def backbone(grid: Grid, T: np.ndarray, strain: np.ndarray, s: np.ndarray) -> np.ndarray:

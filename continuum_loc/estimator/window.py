@@ -18,10 +18,10 @@ from continuum_loc.estimator.chain import Chain, SingularError
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.factors import FACTORS, Factor, MeasurementError, TofFactor
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.output import Body, backbone, body_at, body_between
+from continuum_loc.estimator.output import MOTION, Body, backbone, body_between, motion_covariance
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import STRAIN, Column, Grid, column_at_rest
+from continuum_loc.estimator.state import NODE_DIM, Column, Grid, column_at_rest
 from continuum_loc.measurements import ImuSample, Measurement, TofFrame, seconds
 from continuum_loc.robot import RobotDescription
 
@@ -164,10 +164,11 @@ class SlidingWindowFilter:
 
     def _marginalise_oldest(self) -> None:
         """Drop the oldest column and keep its message; its neighbour's linearisation point is then pinned."""
-        if self.intervals[0].changed:
-            self._linearise()
-        self.chain.solve([interval.blocks for interval in self.intervals[:-1]], 0)
-        self.chain.forget_oldest()
+        oldest = self.intervals[0]
+        changed = oldest.changed
+        if changed:
+            oldest.linearise(self.priors, self.columns[0], self.columns[1])
+        self.chain.forget_oldest(oldest.blocks, changed)
         del self.columns[0], self.offsets[0], self.intervals[0]
         self._marginalised = True
 
@@ -191,8 +192,7 @@ class SlidingWindowFilter:
         limit = solver.max_iterations if self.acquired else solver.acquisition_iterations
         damping, first = 0.0, self._linearise()
         for iteration in range(1, limit + 1):
-            before = self.columns.copy(), self.offsets.copy()
-            cost = self._cost()
+            before = None if self.acquired else (self.columns.copy(), self.offsets.copy(), self._cost())
             try:
                 offsets = self.chain.solve([interval.blocks for interval in self.intervals], first, damping)
             except SingularError:
@@ -204,8 +204,8 @@ class SlidingWindowFilter:
             first = self._move(offsets)
             self._set_gate(iteration)
             first = min(first, self._linearise())
-            if self._cost() > cost * (1.0 + COST_SLACK) + 1.0 and self.acquired is False:
-                self.columns, self.offsets = before
+            if before is not None and self._cost() > before[2] * (1.0 + COST_SLACK) + 1.0:
+                self.columns, self.offsets = before[:2]
                 for interval in self.intervals:
                     interval.changed = True
                 first, damping = self._linearise(), max(10.0 * damping, 1e-3)
@@ -326,36 +326,34 @@ class SlidingWindowFilter:
 
     def _estimate(self, iterations: int, converged: bool, elapsed: float) -> Estimate:
         now = seconds(self.newest, self.epoch)
-        lagged_time = max(now - self.settings.lag, self.columns[0].time)
-        count = min(len(self.columns), 2 + int(np.ceil((self.columns[-1].time - lagged_time)
-                                                       / self.settings.knot_period)))
-        marginals, crosses = self.chain.covariances(count)
-        columns = [column.retract(offset) for column, offset in
-                   zip(self.columns[-count:], self.offsets[-count:], strict=True)]
+        before = now - self.settings.lag
         lagged = None
-        if self.settings.lag > 0.0 and now - self.columns[0].time >= self.settings.lag:
-            lagged = self._compose(columns, marginals, crosses, lagged_time, converged, iterations, elapsed, None)
-        return self._compose(columns, marginals, crosses, now, converged, iterations, elapsed, lagged)
+        if self.settings.lag > 0.0 and before >= self.columns[0].time:
+            lagged = self._compose(before, converged, iterations, elapsed, None)
+        return self._compose(now, converged, iterations, elapsed, lagged)
 
-    def _compose(self, columns, marginals, crosses, time, converged, iterations, elapsed, lagged) -> Estimate:
-        body = self._body(columns, marginals, crosses, time)
+    def _compose(self, time: float, converged: bool, iterations: int, elapsed: float,
+                 lagged: Estimate | None) -> Estimate:
+        body, covariance = self._body(time)
         rings = self.grid.ring_nodes
         squared, count, inliers = self._fit()
         return Estimate(
-            stamp=self.epoch + round(time * 1e9), T_map_ring=body.T[rings], covariance=body.covariance[rings][:, :6, :6],
-            strain=body.strain[rings], velocity=body.velocity[rings],
-            velocity_covariance=body.covariance[rings][:, 12:, 12:], backbone_s=self._backbone_s,
+            stamp=self.epoch + round(time * 1e9), T_map_ring=body.T[rings], covariance=covariance[:, :6, :6],
+            strain=body.strain[rings], velocity=body.velocity[rings], velocity_covariance=covariance[:, 6:, 6:],
+            backbone_s=self._backbone_s,
             T_map_backbone=backbone(self.grid, body.T, body.strain, self._backbone_s),
             status="tracking" if self.acquired else "initialising", consistency=squared / max(count, 1),
             inliers=inliers, iterations=iterations, converged=converged, step_seconds=elapsed, lagged=lagged)
 
-    def _body(self, columns, marginals, crosses, time) -> Body:
-        k = int(np.searchsorted([column.time for column in columns], time - TIME_EPSILON)) - 1
-        if k < 0:
-            return body_at(columns[0], marginals[0])
-        prior = self.settings.prior
-        return body_between(columns[k], columns[k + 1], marginals[k], crosses[k], marginals[k + 1], time,
-                            np.array(prior.velocity), np.array(prior.strain_rate))
+    def _body(self, time: float) -> tuple[Body, np.ndarray]:
+        """The nodes at `time` in the window, and the covariance (R + 1, 12, 12) of each ring's [pose, velocity]."""
+        k = int(np.searchsorted([column.time for column in self.columns], time - TIME_EPSILON)) - 1
+        k = min(max(k, 0), len(self.intervals) - 1)
+        a, b = (self.columns[i].retract(self.offsets[i]) for i in (k, k + 1))
+        rings = self.grid.ring_nodes
+        rows = (NODE_DIM * rings[:, None] + MOTION).ravel()
+        P = self.chain.joint_covariance(k, rows)
+        return body_between(a, b, time), motion_covariance(a, b, time, rings, P, np.array(self.settings.prior.velocity))
 
     def _fit(self) -> tuple[float, int, dict[str, float]]:
         """Squared normalised residuals and their number over the window, and the share of fitting zones by sensor."""

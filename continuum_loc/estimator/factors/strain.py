@@ -49,7 +49,9 @@ class StrainFactor(Factor):
     def stack(self, times, rows):
         """Rows of one interval grouped by station, as the geometry of a station serves all its samples."""
         s = np.concatenate([row[0] for row in rows])
-        stations, station = np.unique(s, return_inverse=True)
+        stations, station = rows[0][0], np.tile(np.arange(len(rows[0][0])), len(rows))
+        if len(s) != len(station) or not np.array_equal(s, stations[station]):  # not the same stations every time
+            stations, station = np.unique(s, return_inverse=True)
         segments = [self.grid.segment(x) for x in stations]
         return (np.repeat(times, [len(row[0]) for row in rows]), station.astype(np.int64),
                 np.concatenate([row[1] for row in rows]), np.concatenate([row[2] for row in rows]),
