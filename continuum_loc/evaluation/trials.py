@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from continuum_loc.simulator.world import World
 
 MAP_POINTS = 300_000
+# What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF stamps share.
+MOUNTING_ERROR = (0.002, 1.0)  # m, deg
+GYRO_BIAS = 0.01  # rad/s
+TOF_CLOCK_OFFSET = 0.010  # s
 
 TOPICS = {"TofFrame": "tof/points", "ImuSample": "imu/data_raw", "FieldSample": "imu/mag", "StrainSample": "strain",
           "EncoderSample": "joint_states", "TruthSample": "ground_truth/poses"}
@@ -31,6 +35,7 @@ class Trial:
 
     robot: a bundled name or a YAML file. scene, map_scene: scene names or mesh files; the prior map is that of
     `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity: `paper` or `vl53l5cx`.
+    disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
     duration: seconds; None for the trajectory's own.
     """
 
@@ -128,7 +133,8 @@ def configuration(trial: Trial, estimator: Filter | None = None, **more: Any) ->
     """Everything that a trial was made from, for its run folder."""
     resolved = {"robot": load_robot(trial.robot), "scene": trial.scene, "trajectory": trial.trajectory,
                 "map": {"scene": trial.map_scene or trial.scene, "points": MAP_POINTS}, "profile": trial.profile,
-                "tof_fidelity": trial.fidelity, "seed": trial.seed, "duration": trial.duration}
+                "tof_fidelity": trial.fidelity, "disturbed": trial.disturbed, "seed": trial.seed,
+                "duration": trial.duration}
     if estimator is not None:
         resolved["estimator"] = estimator.settings
     return {**resolved, **more}

@@ -1,0 +1,129 @@
+"""Many trials: several processes, one failure takes no other along, and an interrupted campaign continues.
+
+    OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay the same bag
+    OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from continuum_loc.evaluation.study import plain
+from continuum_loc.evaluation.trials import Trial
+
+if TYPE_CHECKING:
+    from continuum_loc.estimator.settings import EstimatorSettings
+
+Progress = Callable[[Iterator[Any], int, str], Iterator[Any]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a trial: its summary, or the error (last line of a traceback) that ended it."""
+
+    trial: Trial
+    summary: dict[str, Any] | None
+    error: str = ""
+
+
+def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: EstimatorSettings | None = None,
+                 progress: Progress | None = None) -> list[Outcome]:
+    """Run the trials that have not been run yet, and return all outcomes in the order of `trials`.
+
+    The number of jobs changes nothing but the time: each trial is seeded and runs in one process by itself.
+    """
+    progress = progress or _bar
+    bags = {trial.recording: trial for trial in trials if not _bag(out, trial).is_dir()}
+    failed = {}
+    for done in progress(_parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
+        failed |= done
+    todo = [(out, trial, settings) for trial in trials if trial.recording not in failed]
+    found = {}
+    for outcome in progress(_parallel(_estimate, todo, jobs), len(todo), "estimating"):
+        found[outcome.trial] = outcome
+    return [found.get(trial) or Outcome(trial, None, failed[trial.recording]) for trial in trials]
+
+
+def _parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]:
+    """Results of `work(*arguments)` as they come. A worker that dies ends the campaign; what is done stays done."""
+    if jobs == 1:
+        yield from (work(*each) for each in arguments)
+        return
+    import multiprocessing
+
+    # Fresh interpreters: forked ones would share the state of numeric libraries' threads.
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_one_thread) as pool:
+        for future in as_completed([pool.submit(work, *each) for each in arguments]):
+            yield future.result()
+
+
+def _one_thread() -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def _bag(out: Path, trial: Trial) -> Path:
+    return out / "bags" / trial.recording
+
+
+def _record(out: Path, trial: Trial) -> dict[str, str]:
+    """Simulate into a bag. Returns {recording: error} of what failed."""
+    from continuum_loc.evaluation.trials import simulate, write_bag
+
+    bag = _bag(out, trial)
+    partial = bag.with_name(f".{bag.name}.{os.getpid()}")
+    try:
+        bag.parent.mkdir(parents=True, exist_ok=True)
+        write_bag(partial, simulate(trial))
+        partial.rename(bag)  # a bag under its name is a whole one
+    except Exception as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        return {trial.recording: f"simulating: {type(error).__name__}: {error}"}
+    return {}
+
+
+def _estimate(out: Path, trial: Trial, settings: EstimatorSettings | None) -> Outcome:
+    """Replay a trial's bag, or take the result of an earlier run with the same configuration."""
+    folder = out / "trials" / trial.name
+    try:
+        return _run(folder, _bag(out, trial), trial, settings)
+    except Exception as error:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "error.txt").write_text(traceback.format_exc())
+        return Outcome(trial, None, f"{type(error).__name__}: {error}")
+
+
+def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | None) -> Outcome:
+    from continuum_loc.evaluation.replay import replay
+    from continuum_loc.evaluation.runs import save_run
+    from continuum_loc.evaluation.trials import configuration, make_filter, scene_map
+    from continuum_loc.robot import load_robot
+
+    estimator = make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene), settings)
+    resolved = configuration(trial, estimator)
+    key = hashlib.sha256(json.dumps([plain(resolved), asdict(trial)], sort_keys=True).encode()).hexdigest()
+    summary_file = folder / "summary.json"
+    if summary_file.is_file():
+        summary = json.loads(summary_file.read_text())
+        if summary.get("configuration_digest") == key:
+            return Outcome(trial, summary)
+    (folder / "error.txt").unlink(missing_ok=True)
+    result = replay(bag, estimator)
+    return Outcome(trial, save_run(folder, result, kind="trial", seed=trial.seed, configuration=resolved,
+                                   extra={"configuration_digest": key}))
+
+
+def _bar(results: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+    from rich.console import Console
+    from rich.progress import track
+
+    return track(results, label, total=total, console=Console(stderr=True), transient=True)

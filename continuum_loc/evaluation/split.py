@@ -1,0 +1,26 @@
+"""Which trials the filter's numbers were tuned on. Tables may show them, claims may not rest on them."""
+
+from __future__ import annotations
+
+from continuum_loc.evaluation.trials import Trial
+
+# One hold-out per robot, as in the paper: a trajectory in a fully known environment, under a seed of its own.
+HOLD_OUT = {"engine": Trial(robot="engine", scene="S0", trajectory="t1", seed=1000),
+            "soft_arm": Trial(robot="soft_arm", scene="R4", trajectory="b1", seed=1000)}
+
+
+class SplitError(ValueError):
+    """A trial on the wrong side of the split."""
+
+
+def is_hold_out(trial: Trial) -> bool:
+    """Whether the trial's scene and trajectory are those of its robot's hold-out, whatever the seed."""
+    held = HOLD_OUT.get(trial.robot)
+    return held is not None and (trial.scene, trial.trajectory) == (held.scene, held.trajectory)
+
+
+def require_unseen(trials: list[Trial]) -> None:
+    """Raises SplitError when a claim would rest on the scene and trajectory that the filter was tuned on."""
+    seen = sorted({trial.name for trial in trials if is_hold_out(trial)})
+    if seen:
+        raise SplitError(f"tuned on, so no claim may rest on it: {', '.join(seen)}")
