@@ -133,8 +133,9 @@ def test_optimum_on_the_bounds_is_the_constrained_one():
     assert fit.converged.all() and fit.interior.tolist() == [False, False, True]
     for m in range(3):
         size = np.linalg.norm(field[m])
-        scipy = least_squares(lambda q, m=m, size=size: (ring_field(MAGNET, q) - field[m]) / size, [0.02, 0.001, 0.001],
-                              bounds=(solver.lower[m], solver.upper[m]), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale=0.01)
+        scipy = least_squares(lambda q, m=m, size=size: (ring_field(MAGNET, q) - field[m]) / size,
+                              [0.02, 0.001, 0.001], bounds=(solver.lower[m], solver.upper[m]), x_scale=0.01,
+                              xtol=1e-15, ftol=1e-15, gtol=1e-15)
         np.testing.assert_allclose(fit.position[m], scipy.x, atol=1e-6)
 
 

@@ -56,13 +56,13 @@ def projected_quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples
     """
     p, n = project(points), project(tangents)
     chord = np.diff(p, axis=0)
-    denominator = _cross(n[:-1], n[1:])
+    denominator = cross(n[:-1], n[1:])
     with np.errstate(divide="ignore", invalid="ignore"):
-        kappa = _cross(chord, n[1:]) / denominator
+        kappa = cross(chord, n[1:]) / denominator
     length = np.linalg.norm(chord, axis=1)
     meets = (np.abs(denominator) > PARALLEL) & (kappa > 0.0) & (kappa < 2.0 * length)
     control = np.where(meets[:, None], p[:-1] + np.where(meets, kappa, 0.0)[:, None] * n[:-1], p[:-1] + 0.5 * chord)
-    return lift(_quadratic_chain(p[:-1], control, p[1:], samples), points)
+    return lift(quadratic_chain(p[:-1], control, p[1:], samples), points)
 
 
 def projected_cubic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
@@ -85,7 +85,7 @@ def quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> 
     both; two can always, with the control polygon of the biarc.
     """
     start, middle, end, first, second = _biarc_polygon(points, tangents)
-    return _quadratic_chain(_interleave(start, middle), _interleave(first, second), _interleave(middle, end), samples)
+    return quadratic_chain(_interleave(start, middle), _interleave(first, second), _interleave(middle, end), samples)
 
 
 def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) -> np.ndarray:
@@ -203,7 +203,7 @@ def _pieces(count: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
     return piece, position - piece
 
 
-def _quadratic_chain(start: np.ndarray, control: np.ndarray, end: np.ndarray, samples: int) -> np.ndarray:
+def quadratic_chain(start: np.ndarray, control: np.ndarray, end: np.ndarray, samples: int) -> np.ndarray:
     """(samples, D) along quadratic Bezier pieces, eq. 13."""
     piece, u = _pieces(len(start), samples)
     u = u[:, None]
@@ -215,7 +215,7 @@ def _bernstein(t: np.ndarray) -> np.ndarray:
     return np.stack([(1 - t) ** 3, 3 * (1 - t) ** 2 * t, 3 * (1 - t) * t**2, t**3], axis=-1)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 

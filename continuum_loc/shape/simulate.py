@@ -1,13 +1,13 @@
 """Samples of a Hall + IMU arm in exactly known shapes: grooves, S-shapes, bending out of a plane.
 
-The arm is a chain of arcs of constant strain, one from each module to the next and one to the tip. A motion
+The arm is a chain of short arcs of constant strain, `PIECES` from each module to the next and to the tip. A motion
 holds a posture or passes smoothly to the next. The field is the true ring magnet's and the Earth's; chips are
 mounted askew, have offsets, noise, quantisation steps and full scales, and every module keeps its own clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ from continuum_loc.shape.calibration import PosedRest, module_mounts, straight_m
 from continuum_loc.shape.magnet import ring_field
 from continuum_loc.shape.rest import RestWindow
 
+PIECES = 6
 GROOVES = {"straight": 0.0, "160 mm": 1.0 / 0.080, "80 mm": 1.0 / 0.040}  # curvature by groove diameter [1/m]
 
 
@@ -44,8 +45,7 @@ PERFECT = Imperfections(mounting_deg=0.0, hall_offset=0.0, accel_offset=0.0, mom
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posture:
-    """Rotation of the base in map (3, 3), and twist and curvatures (M + 1, 3) [1/m] of the arc before each
-    module and of the one to the tip."""
+    """Rotation of the base in map (3, 3), and twist and curvatures (N, 3) [1/m] of the N arcs from base to tip."""
 
     R_map_base: np.ndarray
     strain: np.ndarray
@@ -70,7 +70,7 @@ class Motion:
         return self.arrivals + np.asarray(self.hold)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """R_map_base (K, 3, 3) and strain (K, M + 1, 3) at times (K,); acceleration is continuous throughout."""
+        """R_map_base (K, 3, 3) and strain (K, N, 3) at times (K,); acceleration is continuous throughout."""
         arrivals, departures = self.arrivals, self.departures
         knots = np.sort(np.concatenate([arrivals, departures]))
         index = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
@@ -89,21 +89,32 @@ class Motion:
 
 
 def bent(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.ndarray:
-    """(M + 1, 3) strain of one arc: the robot bends by `curvature` [1/m] from x towards y turned by `azimuth`."""
-    return np.tile([0.0, -curvature * np.sin(azimuth), curvature * np.cos(azimuth)], (len(robot.hall) + 1, 1))
+    """(N, 3) strain of one arc: the robot bends by `curvature` [1/m] from x towards y turned by `azimuth`."""
+    return profile(robot, lambda s: (np.full_like(s, curvature), np.full_like(s, azimuth)))
 
 
 def s_shape(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.ndarray:
-    """(M + 1, 3) strain of an S: the far half bends the other way."""
-    strain = bent(robot, curvature, azimuth)
-    strain[len(strain) // 2:] *= -1.0
-    return strain
+    """(N, 3) strain of an S, whose curvature passes smoothly from `curvature` [1/m] at the base to its opposite."""
+    return profile(robot, lambda s: (curvature * np.cos(np.pi * s / robot.length), np.full_like(s, azimuth)))
 
 
 def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi / 2) -> np.ndarray:
-    """(M + 1, 3) strain whose bending plane turns by `turn` [rad] from base to tip."""
-    return np.concatenate([bent(robot, curvature, azimuth)[:1]
-                           for azimuth in np.linspace(0.0, turn, len(robot.hall) + 1)])
+    """(N, 3) strain of `curvature` [1/m] whose bending plane turns by `turn` [rad] from base to tip."""
+    return profile(robot, lambda s: (np.full_like(s, curvature), turn * s / robot.length))
+
+
+def profile(robot: RobotDescription, bend: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """(N, 3) strain of a twist-free shape: `bend` gives curvature [1/m] and azimuth [rad] at arclengths (N,)."""
+    ends = piece_ends(robot)
+    curvature, azimuth = bend(ends - 0.5 * np.diff(ends, prepend=0.0))
+    return np.column_stack([np.zeros_like(ends), -curvature * np.sin(azimuth), curvature * np.cos(azimuth)])
+
+
+def piece_ends(robot: RobotDescription) -> np.ndarray:
+    """(N,) arclengths [m] of the ends of the arcs: every `PIECES`-th is a module's, the last is the tip's."""
+    marks = np.array([0.0, *(robot.sensor_arclength(sensor.name) for sensor in robot.hall), robot.length])
+    shares = np.arange(1, PIECES + 1) / PIECES
+    return (marks[:-1, None] + np.diff(marks)[:, None] * shares).ravel()
 
 
 class Arm:
@@ -121,8 +132,8 @@ class Arm:
         self.hall_offset = truth.hall_offset * self.rng.standard_normal((modules, 3))
         remanence = robot.magnet.remanence * (1.0 + truth.moment * self.rng.standard_normal())
         self.magnet = robot.magnet.model_copy(update={"remanence": remanence})
-        ends = [robot.sensor_arclength(sensor.name) for sensor in robot.hall] + [robot.length]
-        self.lengths = np.diff(ends, prepend=0.0)
+        self.ends = piece_ends(robot)
+        self.lengths = np.diff(self.ends, prepend=0.0)
 
     def _askew(self, count: int) -> np.ndarray:
         axis = self.rng.standard_normal((count, 3))
@@ -134,21 +145,23 @@ class Arm:
         turn = np.eye(3) if R_base is None else R_base
         return Posture(turn @ self.robot.base.T_map_base[:3, :3], bent(self.robot, 0.0) if strain is None else strain)
 
-    def T_base_ends(self, strain: np.ndarray) -> np.ndarray:
-        """(..., M + 1, 4, 4) poses of the modules and the tip in the base frame, strain (..., M + 1, 3)."""
+    def T_base_module(self, strain: np.ndarray) -> np.ndarray:
+        """(..., M, 4, 4) poses of the modules in the base frame, strain (..., N, 3)."""
+        return self._chain(strain)[..., PIECES - 1:-1:PIECES, :, :]
+
+    def _chain(self, strain: np.ndarray) -> np.ndarray:
+        """(..., N, 4, 4) poses of the ends of all arcs."""
         unit = np.broadcast_to([1.0, 0.0, 0.0], strain.shape)
-        arcs = lie.exp(self.lengths[:, None] * np.concatenate([unit, strain], axis=-1))
-        T = [arcs[..., 0, :, :]]
-        for m in range(1, strain.shape[-2]):  # a chain of four
-            T.append(T[-1] @ arcs[..., m, :, :])
-        return np.stack(T, axis=-3)
+        T = lie.exp(self.lengths[:, None] * np.concatenate([unit, strain], axis=-1))
+        for n in range(1, strain.shape[-2]):
+            T[..., n, :, :] = T[..., n - 1, :, :] @ T[..., n, :, :]
+        return T
 
     def backbone(self, strain: np.ndarray, s: np.ndarray) -> np.ndarray:
         """(S, 3) true positions in the base frame at arclengths s (S,) [m]."""
-        ends = np.cumsum(self.lengths)
-        piece = np.minimum(np.searchsorted(ends, s), len(ends) - 1)
-        start = np.concatenate([np.eye(4)[None], self.T_base_ends(strain)[:-1]])
-        within = s - np.concatenate([[0.0], ends[:-1]])[piece]
+        piece = np.minimum(np.searchsorted(self.ends, s), len(self.ends) - 1)
+        start = np.concatenate([np.eye(4)[None], self._chain(strain)[:-1]])
+        within = s - np.concatenate([[0.0], self.ends[:-1]])[piece]
         step = lie.exp(within[:, None] * np.hstack([np.tile([1.0, 0.0, 0.0], (len(s), 1)), strain[piece]]))
         return (start[piece] @ step)[:, :3, 3]
 
@@ -167,7 +180,7 @@ class Arm:
     def _poses(self, m: int, motion: Motion, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """R_map_base (K, 3, 3) and T_base_module (K, 4, 4) of module m."""
         R_map_base, strain = motion.at(times)
-        return R_map_base, self.T_base_ends(strain)[:, m]
+        return R_map_base, self.T_base_module(strain)[:, m]
 
     def _imu(self, m: int, motion: Motion, times: np.ndarray, start: int) -> Iterator[ImuSample]:
         model, noise, h = self.robot.imu_model, self.imperfections.noise, 1e-3
