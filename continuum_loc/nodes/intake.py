@@ -49,6 +49,7 @@ class Inbox:
 
     def __init__(self, settings: IntakeSettings) -> None:
         self.settings = settings
+        self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self._queues: dict[str, deque[Queued]] = {name: deque() for name in SACRIFICE}
         self._ready = threading.Condition()
@@ -62,6 +63,7 @@ class Inbox:
         """Queue a message; older ones are dropped where the queue has grown too long."""
         kind = TRACKER if topic.startswith(TRACKER) else topic
         with self._ready:
+            self.received[topic] += 1
             self._queues[kind].append(Queued(self._order, topic, message, arrival, time.monotonic()))
             self._order += 1
             self._size += 1
@@ -155,7 +157,6 @@ class Intake:
                  frame_prefix: str = "") -> None:
         self.robot, self.settings, self.frame_prefix = robot, settings, frame_prefix
         self.gate = StampGate(settings)
-        self.received: Counter[str] = Counter()
         self.used: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self._report = report
@@ -166,7 +167,6 @@ class Intake:
 
     def accept(self, topic: str, message: Any, arrival: int, now: int) -> Measurement | None:
         """The measurement of a message, or None where it is refused (counted, and reported once per class)."""
-        self.received[topic] += 1
         try:
             measurement = self._checked(topic, message, arrival)
             refusal = self.gate.judge(measurement.stamp, getattr(measurement, "sensor", topic), now)

@@ -116,6 +116,7 @@ class SimulatorNode(PackageNode):
     def _begin(self, first: int) -> None:
         """The first sample is due one lookahead from now: from there, data time is the node's clock."""
         self._shift = self.now() + round(self.settings.lookahead * 1e9) - first
+        self.get_logger().info("data begins")
 
     def _deliver(self, stamp: int, sample: Any, delay: float) -> None:
         topic = TRACKER + sample.sensor if isinstance(sample, TrackedPose) else TOPIC_OF[type(sample)]

@@ -94,7 +94,7 @@ class WorkerNode(PackageNode):
 
     def counts(self) -> dict[str, Any]:
         """What was received, used, refused (by class of error) and dropped (by topic) before the estimator."""
-        return {"received": dict(self.intake.received), "used": dict(self.intake.used),
+        return {"received": dict(self.inbox.received), "used": dict(self.intake.used),
                 "refused": dict(self.intake.refused), "dropped": dict(self.inbox.dropped),
                 "restarts": self.intake.gate.restarts, "failures": self.failures}
 
@@ -189,7 +189,7 @@ class WorkerNode(PackageNode):
         level, text, values = self.describe()
         for check in (self._check_losses, self._check_lag, self._check_silence):
             level, text = max((level, text), check(), key=lambda pair: pair[0])
-        values = {"received": sum(self.intake.received.values()), "used": sum(self.intake.used.values()),
+        values = {"received": sum(self.inbox.received.values()), "used": sum(self.intake.used.values()),
                   "refused": dict(self.intake.refused), "dropped": dict(self.inbox.dropped), "queue": len(self.inbox),
                   **values}
         shown = {key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in values.items()}
