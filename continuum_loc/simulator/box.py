@@ -83,7 +83,7 @@ def _sign() -> Part:
     left = board.translate((-spread / 4, 0.0, height / 2))
     grip = box((0.024, 0.07, 0.03)).translate((0.0, 0.0, height + 0.005))
     pieces = [left, left.mirror((1.0, 0.0, 0.0)), grip]
-    return _standing("wet_floor_sign", pieces, (-0.235, -0.14), turn_deg=30.0, reflectance=0.75)
+    return _standing("wet_floor_sign", pieces, (-0.205, -0.19), turn_deg=40.0, reflectance=0.75)
 
 
 _OBJECTS: tuple[Callable[[], Part], ...] = (_mustard, _cup, _cracker_box, _sign)

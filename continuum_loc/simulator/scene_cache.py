@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -47,14 +48,12 @@ def _write(scene: Scene, entry: Path) -> None:
         **_pack("anomaly_vertices", [a.vertices for a in scene.anomalies]),
         **_pack("anomaly_faces", [a.faces for a in scene.anomalies], np.int32),
     }
-    partial = entry.with_name(f"{entry.stem}.{os.getpid()}.tmp")
-    try:
+    with suppress(OSError):  # a home that is full or read-only costs time on every start, nothing else
         entry.parent.mkdir(parents=True, exist_ok=True)
+        partial = entry.with_name(f"{entry.stem}.{os.getpid()}.tmp")
         with partial.open("wb") as file:
             np.savez(file, **arrays)
         partial.replace(entry)  # atomic: another process sees all of it or nothing
-    except OSError:
-        partial.unlink(missing_ok=True)  # a read-only home costs time on every start, nothing else
 
 
 def _read(entry: Path) -> Scene:
