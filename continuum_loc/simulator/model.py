@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from continuum_loc.robot import RobotDescription
+from continuum_loc.robot import Ring, RobotDescription
 from continuum_loc.settings import SettingsError
-from continuum_loc.simulator.plant import PlantSettings, node_arclengths
+from continuum_loc.simulator.plant import PlantSettings, Profile, node_arclengths
 
 if TYPE_CHECKING:
     import mujoco
@@ -101,6 +101,20 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_
     data.qvel[:] = 0.0
 
 
+def uniform_rod(links: int, length: float, EI: float, mass_per_metre: float, *, EA: float | None = None,
+                supported: bool = False, relaxation: float = 0.05, time_step: float = 0.005) -> mujoco.MjModel:
+    """A plain rod along x, clamped at the origin, for comparison with mechanics. Its last body, `tip`, has no mass
+    and lies at the rod's end: loads go there."""
+    robot = RobotDescription(name="rod", length=length, radius=0.01 * length, rings=(Ring(name="end", s=length),))
+    profile = Profile(link_length=length / links, time_step=time_step)
+    plant = PlantSettings(EI=EI, GJ=EI, EA=EA, mass_per_metre=mass_per_metre, relaxation=relaxation,
+                          profiles={"rod": profile})
+    spec = build_spec(robot, plant, None, "rod", supported)
+    tip = spec.body(f"{NODE_PREFIX}{links}").add_body(name="tip")
+    tip.mass, tip.inertia, tip.explicitinertial = 1e-9, (1e-12, 1e-12, 1e-12), True
+    return spec.compile()
+
+
 def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> None:
     """Joint springs are implicit; what stays explicit is the insertion drive, stable to omega * step < 2."""
     omega = np.sqrt(plant.carriage_stiffness / plant.carriage_mass)
@@ -184,8 +198,8 @@ def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
             name = next(names)
             offset = (group.radius * np.cos(azimuth), group.radius * np.sin(azimuth))
             tendon = spec.add_tendon(name=name, frictionloss=group.friction)
-            for i, x in openings[:2 * last]:
-                site = f"{name}_{i}{'b' if x < 0 else 'f'}"
+            for k, (i, x) in enumerate([(0, 0.0), *openings[:2 * last], (last, 0.0)]):
+                site = f"{name}_site{k}"
                 spec.body(f"{NODE_PREFIX}{i}").add_site(name=site, pos=(x, *offset), group=4)
                 tendon.wrap_site(site)
             pull = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_TENDON, target=name,

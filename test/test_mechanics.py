@@ -1,0 +1,221 @@
+"""The simulated rod obeys mechanics: statics, stretch, frequency, dissipation, tendons."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from continuum_loc.robot import Ring, RobotDescription
+from continuum_loc.settings import SettingsError, parse_settings
+from continuum_loc.simulator import model as rod_model
+from continuum_loc.simulator.model import GRAVITY, SimulationDiverged, advance, build_model, settle, uniform_rod
+from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclengths
+from continuum_loc.simulator.reference import cosserat_shape, elastica_tip, first_frequency
+
+LENGTH, EI, MASS = 1.0, 0.05, 0.02
+
+
+def settled_tip(links, force=(0, 0, 0), moment=(0, 0, 0), supported=True, **kwargs):
+    model = uniform_rod(links, LENGTH, EI, MASS, supported=supported, **kwargs)
+    data = mujoco.MjData(model)
+    data.xfrc_applied[-1] = [*force, *moment]
+    settle(model, data, rest_speed=1e-6)
+    mujoco.mj_forward(model, data)
+    return data.body("tip").xpos.copy(), data.body("tip").xmat.reshape(3, 3).copy()
+
+
+def test_reference_solutions_agree_with_each_other():
+    """The shooting solution of the rod's equations reproduces the elliptic integrals of the elastica."""
+    T = cosserat_shape([LENGTH], LENGTH, EI, EI, tip_force=(0, 0, -0.2))[0]
+    x, drop = elastica_tip(0.2, EI, LENGTH)
+    np.testing.assert_allclose(T[:3, 3], [x, 0.0, -drop], atol=1e-7)
+
+
+def test_small_end_load_bends_a_cantilever_by_PL3_over_3EI():
+    tip, _ = settled_tip(50, force=(0, 0, -1e-3))
+    assert -tip[2] == pytest.approx(1e-3 * LENGTH**3 / (3 * EI), rel=2e-3)
+
+
+@pytest.mark.parametrize("force", [0.05, 0.2, 0.5])
+def test_large_end_load_gives_the_elastica(force):
+    tip, _ = settled_tip(24, force=(0, 0, -force))
+    x, drop = elastica_tip(force, EI, LENGTH)
+    assert np.linalg.norm(tip - [x, 0.0, -drop]) < 0.005 * LENGTH
+
+
+def test_end_moment_bends_the_rod_to_a_circular_arc():
+    angle = 2.0
+    tip, R = settled_tip(24, moment=(0, angle * EI / LENGTH, 0))
+    radius = LENGTH / angle
+    expected = np.array([np.sin(angle), 0.0, np.cos(angle) - 1.0]) * radius
+    assert np.linalg.norm(tip - expected) < 0.005 * LENGTH
+    np.testing.assert_allclose(R[:, 0], [np.cos(angle), 0.0, -np.sin(angle)], atol=1e-6)
+
+
+def test_own_weight_and_a_load_out_of_plane_give_the_cosserat_rod():
+    force = (0.0, 0.05, -0.02)
+    tip, R = settled_tip(24, force=force, supported=False)
+    T = cosserat_shape([LENGTH], LENGTH, EI, EI, weight=MASS * GRAVITY, tip_force=force)[0]
+    assert np.linalg.norm(tip - T[:3, 3]) < 1e-3 * LENGTH
+    assert np.linalg.norm(R - T[:3, :3]) < 2e-3
+
+
+def test_tip_error_falls_with_the_square_of_the_link_length():
+    x, drop = elastica_tip(0.2, EI, LENGTH)
+    errors = [np.linalg.norm(settled_tip(n, force=(0, 0, -0.2))[0] - [x, 0.0, -drop]) for n in (8, 16, 32)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all((orders > 1.9) & (orders < 2.1)), orders
+
+
+def test_hanging_rod_stretches_by_half_its_weight_over_its_stiffness():
+    stiffness = 40.0
+    robot = RobotDescription(name="rod", length=LENGTH, radius=0.01, rings=(Ring(name="end", s=LENGTH),),
+                             base={"rpy_deg": (0.0, 90.0, 0.0)})
+    plant = PlantSettings(EI=EI, GJ=EI, EA=stiffness, mass_per_metre=MASS,
+                          profiles={"live": {"link_length": LENGTH / 20, "time_step": 0.005}})
+    model = build_model(robot, plant)
+    data = mujoco.MjData(model)
+    settle(model, data, rest_speed=1e-6)
+    mujoco.mj_forward(model, data)
+    stretch = -data.body("node20").xpos[2] - LENGTH
+    assert stretch == pytest.approx(MASS * GRAVITY * LENGTH**2 / (2 * stiffness), rel=2e-3)
+
+
+def oscillation(time_step, links=24, duration=8.0):
+    """Damped first mode after a small static load is let go: (frequency [Hz], damping ratio)."""
+    model = uniform_rod(links, LENGTH, EI, MASS, supported=True, relaxation=0.05, time_step=time_step)
+    data = mujoco.MjData(model)
+    data.xfrc_applied[-1, 1] = 1e-3
+    settle(model, data, rest_speed=1e-7)
+    data.xfrc_applied[:] = 0.0
+    model.dof_damping[:] = 0.0  # what damping remains is the integrator's
+    y = np.array([(advance(model, data), data.body("tip").xpos[1])[1] for _ in range(round(duration / time_step))])
+    times = time_step * np.arange(1, len(y) + 1)
+    rising = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
+    crossings = times[rising] - y[rising] / (y[rising + 1] - y[rising]) * time_step
+    peaks = np.array([y[a:b].max() for a, b in zip(rising, rising[1:], strict=False)])
+    decrement = np.log(peaks[1] / peaks[-1]) / (len(peaks) - 2)
+    return 1.0 / np.diff(crossings).mean(), decrement / (2 * np.pi)
+
+
+@pytest.mark.parametrize("time_step", [0.002, 0.005])
+def test_first_mode_has_the_frequency_of_euler_and_bernoulli_and_the_integrators_damping(time_step):
+    frequency, damping = oscillation(time_step)
+    expected = first_frequency(EI, MASS, LENGTH)
+    assert frequency == pytest.approx(expected, rel=0.02)
+    assert damping == pytest.approx(np.pi * expected * time_step, rel=0.1)  # zeta = omega h / 2
+
+
+def test_a_released_rod_only_loses_energy():
+    model = uniform_rod(24, LENGTH, EI, MASS)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data = mujoco.MjData(model)
+    energy = []
+    for _ in range(400):
+        advance(model, data)
+        energy.append(data.energy.sum())
+    lost = energy[0] - energy[-1]
+    assert lost > 0.05 * MASS * GRAVITY * LENGTH
+    assert np.diff(energy).max() < 1e-3 * lost
+
+
+def tendon_rod(EA=None, relaxation=0.05, max_force=200.0):
+    robot = RobotDescription(name="rod", length=LENGTH, radius=0.03, rings=(Ring(name="end", s=LENGTH),))
+    plant = PlantSettings(EI=EI, GJ=EI, EA=EA, mass_per_metre=MASS, relaxation=relaxation,
+                          tendons=({"end": LENGTH, "azimuth_deg": (0, 90, 180, 270), "radius": 0.02,
+                                    "max_force": max_force},),
+                          profiles={"live": {"link_length": LENGTH / 40, "time_step": 0.005}})
+    return plant, build_model(robot, plant, supported=True)
+
+
+@pytest.mark.parametrize("moment", [(0.05, 0.0), (0.0, 0.06), (-0.04, 0.03)])
+def test_tensions_for_a_moment_bend_the_rod_by_that_moment(moment):
+    """The tip turns by L / EI times the moment, about the moment's axis."""
+    plant, model = tendon_rod()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = plant.tension_for_moments(np.array([moment]), pretension=0.5)
+    settle(model, data, rest_speed=1e-6)
+    mujoco.mj_forward(model, data)
+    quat = data.body("node40").xquat
+    turn = np.zeros(3)
+    mujoco.mju_quat2Vel(turn, quat, 1.0)
+    np.testing.assert_allclose(turn, [0.0, moment[0] * LENGTH / EI, moment[1] * LENGTH / EI], atol=0.01)
+
+
+def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
+    stiffness = 100.0
+    _, model = tendon_rod(EA=stiffness)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 2.0
+    settle(model, data, rest_speed=1e-6)
+    mujoco.mj_forward(model, data)
+    assert LENGTH - data.body("node40").xpos[0] == pytest.approx(8.0 * LENGTH / stiffness, rel=1e-3)
+    np.testing.assert_allclose(data.ten_length, LENGTH * (1.0 - 8.0 / stiffness), rtol=1e-3)
+
+
+def test_tensions_are_never_below_the_pretension_nor_above_the_limit():
+    plant = load_plant("engine")
+    moments = np.random.default_rng(1).normal(0.0, 20.0, (200, 3, 2))
+    tension = plant.tension_for_moments(moments, pretension=3.0)
+    assert tension.shape == (200, 9)
+    assert tension.min() >= 3.0 and np.all(tension <= plant.max_forces)
+
+
+def test_a_diverging_simulation_stops_with_the_joint_and_what_to_change():
+    _, model = tendon_rod(relaxation=0.0, max_force=1e7)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = [1e7, 0.0, 0.0, 0.0]
+    with pytest.raises(SimulationDiverged, match=r"diverged at .* joint '(bend|stretch)\d+'.*time_step"):
+        for _ in range(2000):
+            advance(model, data)
+
+
+def test_a_robot_that_never_rests_is_refused(monkeypatch):
+    monkeypatch.setattr(rod_model, "SETTLE_LIMIT", 0.2)
+    model = uniform_rod(10, LENGTH, EI, MASS)
+    with pytest.raises(SimulationDiverged, match="did not come to rest"):
+        settle(model, mujoco.MjData(model))
+
+
+def test_an_unstable_time_step_is_refused_before_the_start():
+    plant = load_plant("engine").model_copy(update={"carriage_stiffness": 1e8})
+    from continuum_loc.robot import load_robot
+
+    with pytest.raises(SettingsError, match=r"time_step 0.005 s is too long .* use at most"):
+        build_model(load_robot("engine"), plant)
+
+
+@pytest.mark.parametrize("name", ["engine", "soft_arm", "hall_arm"])
+def test_every_ring_and_module_end_is_a_node(name):
+    from continuum_loc.robot import load_robot
+
+    robot, plant = load_robot(name), load_plant(name)
+    for profile in plant.profiles.values():
+        nodes = node_arclengths(robot, plant, profile.link_length)
+        wanted = [0.0, robot.length, *robot.ring_arclengths, *(group.end for group in plant.tendons)]
+        assert np.abs(nodes[:, None] - wanted).min(axis=0).max() < 1e-9
+        assert np.all(np.diff(nodes) > 0) and np.diff(nodes).max() < 1.5 * profile.link_length
+
+
+def test_the_full_engine_profile_is_the_papers():
+    from continuum_loc.robot import load_robot
+
+    plant = load_plant("engine")
+    nodes = node_arclengths(load_robot("engine"), plant, plant.profile("full").link_length)
+    assert len(nodes) == 151
+    np.testing.assert_allclose(np.diff(nodes), 0.01, atol=1e-9)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"GJ": 4.0}, "GJ = 4.0 must equal EI"), ({"EI": -1.0}, "EI"), ({"stifness": 1.0}, "unknown key 'stifness'"),
+    ({"profiles": {"live": {"link_length": 0.03, "time_step": 0.5}}}, "time_step"),
+])
+def test_bad_plants_are_refused_with_their_place(change, message):
+    with pytest.raises(SettingsError, match=message):
+        parse_settings(PlantSettings, {**load_plant("engine").model_dump(), **change}, where="plant.yaml")
+
+
+def test_unknown_plants_and_profiles_name_the_valid_ones():
+    with pytest.raises(SettingsError, match="engine, hall_arm, soft_arm"):
+        load_plant("enginee")
+    with pytest.raises(SettingsError, match="full, live"):
+        load_plant("engine").profile("fast")
