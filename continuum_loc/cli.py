@@ -63,8 +63,11 @@ def demo(robot: Robot = "engine", scene: Scene = "S0",
     console.print(_run_table(outcome.summary))
     console.print(f"report  [link=file://{outcome.folder}/report.html]{outcome.folder}/report.html[/link]")
     console.print(f"bag     {outcome.bag}")
+    for claim in outcome.claims:
+        if not claim.holds:  # a slow machine is no failure of the demo; two different replays are
+            errors.print(f"[yellow]missed:[/] {claim.name} {claim.value:.3g} {claim.unit} (bound {claim.bound})",
+                         highlight=False)
     if not outcome.identical:
-        errors.print("[bold red]failed:[/] two replays of the same bag differ", highlight=False)
         raise typer.Exit(FAILED)
     console.print("replay  two replays of the bag without ROS gave the same estimate, to the last bit")
 

@@ -60,7 +60,7 @@ def test_the_worst_moment_comes_first_and_leads_to_its_frame(run, page):
     worst = next(part for group in run_page(run, Context()).groups for part in group if part.title.startswith("Worst"))
     first = worst.table.rows[0]
     assert first.cells[:2] == ["2.00", "ring5"]
-    shown = moments(run.result, 90, 100, extra=errors(settled(run.result.track), run.result.truth).stamps)
+    shown = moments(run.result, 90, 100, 0.5, extra=errors(settled(run.result.track), run.result.truth).stamps)
     assert (shown[first.frame].stamp - run.result.track.stamps[0]) / NANOSECONDS == pytest.approx(2.0)
     assert f'data-frame="{first.frame}"' in page
 

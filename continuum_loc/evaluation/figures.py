@@ -169,7 +169,7 @@ def camera_towards(around: Surroundings, shown: list[Moment]) -> dict:
     # Plotly's camera works in units of the data's box scaled to about one, seen from its middle.
     unit = np.prod(np.maximum(high - low, 1e-9)) ** (1.0 / 3.0)
     centre = (0.5 * (body.min(axis=0) + body.max(axis=0)) - 0.5 * (low + high)) / unit
-    eye = centre + np.array([-0.55, -1.15, 0.6])
+    eye = centre + np.array([-0.45, -0.95, 0.5])
     return {name: dict(zip("xyz", place.tolist(), strict=True)) for name, place in (("center", centre), ("eye", eye))}
 
 
@@ -180,7 +180,7 @@ def _still_traces(around: Surroundings) -> list[go.Scatter3d | go.Mesh3d]:
     if len(around.faces):
         x, y, z = _compact(around.vertices).T
         i, j, k = around.faces.T.astype(np.int32)
-        traces.append(go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, color="#c3cfdd", opacity=0.38, flatshading=True,
+        traces.append(go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, color="#d3dbe6", opacity=0.3, flatshading=True,
                                 name="scene", showlegend=True, hoverinfo="skip",
                                 lighting={"ambient": 0.75, "diffuse": 0.45, "specular": 0.05, "roughness": 0.9}))
     if len(around.map_points):

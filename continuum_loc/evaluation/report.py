@@ -119,7 +119,7 @@ def run_page(run: Run, context: Context) -> Page:
     found = errors(settled(result.track), result.truth)
     worst = worst_moments(found)
     epoch = int(result.track.stamps[0]) if len(result.track) else 0
-    shown = moments(result, FRAMES, FRAME_POINTS, extra=found.stamps[worst])
+    shown = moments(result, FRAMES, FRAME_POINTS, REACH, extra=found.stamps[worst])
     frame_of = {moment.stamp: index for index, moment in enumerate(shown)}
     around = surroundings(result, context.mesh, context.map_points, REACH, SCENE_FACES, MAP_POINTS)
     view = Part("The robot in its scene", "Drag to turn, scroll or pinch to zoom; the slider moves through time. "

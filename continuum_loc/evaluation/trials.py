@@ -45,13 +45,21 @@ class Trial:
     map_scene: str | None = None
     profile: str = "live"
     fidelity: str = "paper"
+    disturbed: bool = False
     seed: int = 0
     duration: float | None = None
 
     @property
+    def recording(self) -> str:
+        """Name of what is simulated; trials that differ in the map alone share it."""
+        length = "" if self.duration is None else f"-{self.duration:g}s"
+        return "-".join([Path(self.robot).stem, Path(self.scene).stem, self.trajectory, self.fidelity, self.profile]
+                        + ["disturbed"] * self.disturbed) + f"-{self.seed}{length}"
+
+    @property
     def name(self) -> str:
-        """Short and unique among the trials of one study."""
-        return f"{self.map_scene or self.scene}-{self.scene}-{self.trajectory}-{self.fidelity}-{self.seed}"
+        """Unique among trials."""
+        return f"{Path(self.map_scene or self.scene).stem}-map-{self.recording}"
 
 
 def world(trial: Trial, faults: tuple = ()) -> World:
@@ -60,8 +68,19 @@ def world(trial: Trial, faults: tuple = ()) -> World:
     from continuum_loc.simulator.world import World
 
     robot = load_robot(trial.robot)
+    if trial.disturbed:
+        robot, faults = _disturbed(robot, trial.seed, faults)
     return World(robot, load_scene(trial.scene) if robot.tof else None, trial.trajectory, profile=trial.profile,
                  tof_fidelity=trial.fidelity, seed=trial.seed, faults=faults)
+
+
+def _disturbed(robot: RobotDescription, seed: int, faults: tuple) -> tuple[RobotDescription, tuple]:
+    """The robot as it truly is, and its clocks."""
+    from continuum_loc.simulator.faults import ClockOffset, miscalibrated
+
+    biased = robot.model_copy(update={"imu_model": robot.imu_model.model_copy(update={"gyro_bias_sigma": GYRO_BIAS})})
+    clock = ClockOffset(sensors=tuple(sensor.name for sensor in robot.tof), offset=TOF_CLOCK_OFFSET)
+    return miscalibrated(biased, *MOUNTING_ERROR, seed=seed), (*faults, clock)
 
 
 def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSample]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from continuum_loc.evaluation.replay import ReplayResult
+from continuum_loc.evaluation.replay import Cloud, ReplayResult
 from continuum_loc.evaluation.tracks import Track
 from continuum_loc.measurements import NANOSECONDS
 
@@ -35,24 +35,36 @@ class Moment:
     points: np.ndarray
 
 
-def moments(result: ReplayResult, count: int, points: int, extra: np.ndarray | None = None) -> list[Moment]:
+def moments(result: ReplayResult, count: int, points: int, reach: float,
+            extra: np.ndarray | None = None) -> list[Moment]:
     """At most `count` evenly spaced instants of the run and those in `extra` (stamps), each with at most `points`
-    ToF points."""
+    ToF points of those in the `swept_box`."""
     track = result.track
     if len(track) == 0:
         return []
+    low, high = swept_box(result, reach)
+    inside = np.all((result.cloud.points >= low) & (result.cloud.points <= high), axis=1)
+    cloud = Cloud(result.cloud.stamps[inside], result.cloud.points[inside])
     chosen = np.unique(np.linspace(0, len(track) - 1, min(count, len(track))).round().astype(int))
     if extra is not None:
         chosen = np.union1d(chosen, np.searchsorted(track.stamps, extra).clip(0, len(track) - 1))
     estimated = track.backbone if track.backbone is not None else smooth_backbone(track.T_map_ring)
     return [Moment(int(track.stamps[k]), estimated[k], true_backbone(result.truth, int(track.stamps[k])),
-                   track.T_map_ring[k, 1:, :3, 3], recent_points(result, int(track.stamps[k]), points))
+                   track.T_map_ring[k, 1:, :3, 3], recent_points(cloud, int(track.stamps[k]), points))
             for k in chosen]
 
 
-def recent_points(result: ReplayResult, stamp: int, most: int) -> np.ndarray:
+def swept_box(result: ReplayResult, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,), (3,) of the box that reaches `reach` [m] beyond everything that the body swept."""
+    track = result.track if len(result.track) else result.truth
+    if len(track) == 0:
+        return np.full(3, -np.inf), np.full(3, np.inf)
+    body = smooth_backbone(track.T_map_ring).reshape(-1, 3)
+    return body.min(axis=0) - reach, body.max(axis=0) + reach
+
+
+def recent_points(cloud: Cloud, stamp: int, most: int) -> np.ndarray:
     """Every n-th of the ToF points placed in the half second before `stamp`, so that at most `most` (M, 3) are left."""
-    cloud = result.cloud
     recent = cloud.points[(cloud.stamps > stamp - CLOUD_SPAN) & (cloud.stamps <= stamp)]
     return recent[:: max(1, -(-len(recent) // most))]
 
@@ -76,13 +88,11 @@ def smooth_backbone(T_map_ring: np.ndarray) -> np.ndarray:
 
 def surroundings(result: ReplayResult, mesh: tuple[np.ndarray, np.ndarray] | None, map_points: np.ndarray | None,
                  reach: float, most_faces: int, most_points: int) -> Surroundings:
-    """The part of the scene's mesh (vertices, faces) and of the prior map inside the box that reaches `reach` [m]
-    beyond everything the body swept, thinned to the given numbers."""
-    track = result.track if len(result.track) else result.truth
-    body = smooth_backbone(track.T_map_ring).reshape(-1, 3)
-    low, high = (body.min(axis=0) - reach, body.max(axis=0) + reach) if len(body) else (-np.inf, np.inf)
+    """The part of the scene's mesh (vertices, faces) and of the prior map in the `swept_box`, thinned to the given
+    numbers."""
+    low, high = swept_box(result, reach)
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), int)
-    if mesh is not None and len(body):
+    if mesh is not None:
         vertices, faces = thinned(*clipped(*mesh, low, high), most_faces)
     points = map_points if map_points is not None else np.empty((0, 3))
     points = points[np.all((points >= low) & (points <= high), axis=1)]
@@ -95,6 +105,7 @@ def clipped(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray,
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = np.array(vertices), np.array(faces)
+    low, high = np.clip(low, -1e6, 1e6), np.clip(high, -1e6, 1e6)  # planes need finite points
     for axis in range(3):
         for origin, sign in ((low, 1.0), (high, -1.0)):
             vertices, faces, _ = slice_faces_plane(vertices, faces, sign * np.eye(3)[axis], origin)
