@@ -81,10 +81,18 @@ class PlantSettings(Settings):
 
         moments: (..., G, 2) total moment about body y and z [N m] inside each tendon set's own stretch, base
         to tip. A set also bends every stretch before its own, so it supplies the difference to the next one.
+        Raises ValueError where a tendon would have to pull harder than it may.
         """
         wanted = moments - np.concatenate([moments[..., 1:, :], np.zeros_like(moments[..., :1, :])], axis=-2)
-        return np.concatenate([_tensions(group, wanted[..., i, :], pretension)
-                               for i, group in enumerate(self.tendons)], axis=-1)
+        tensions = np.concatenate([_tensions(group, wanted[..., i, :], pretension)
+                                   for i, group in enumerate(self.tendons)], axis=-1)
+        excess = (tensions / self.max_forces).reshape(-1, len(self.max_forces)).max(axis=0)
+        if excess.max() > 1.0:
+            worst = int(np.argmax(excess))
+            limit = self.max_forces[worst]
+            raise ValueError(f"{self.tendon_names[worst]} would have to pull {excess[worst] * limit:.0f} N, "
+                             f"its limit is {limit:.0f} N: ask for less bending")
+        return tensions
 
 
 def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.ndarray:
@@ -97,7 +105,7 @@ def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.nda
     tensions = moment @ np.linalg.pinv(arms).T
     if len(angle) >= 3:  # equal tensions of evenly spread tendons cancel, so they can be added freely
         tensions = tensions - tensions.min(axis=-1, keepdims=True)
-    return np.clip(tensions + pretension, pretension, group.max_force)
+    return np.maximum(tensions + pretension, pretension)
 
 
 def load_plant(name_or_path: str | Path) -> PlantSettings:
