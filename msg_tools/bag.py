@@ -15,7 +15,7 @@ from typing import Any
 
 from continuum_loc.measurements import NANOSECONDS
 from msg_tools.errors import BagError, ConvertError
-from msg_tools.factory import bag_messages, typestore
+from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.topics import TOPICS, TRACKER, Topic, cloud_topic_record, topic_spec
 
 _CLOUDS = ("reconstruction", "prior_map")
@@ -182,7 +182,7 @@ def _messages(path: Path, reader: Any, connections: list) -> Iterator[tuple[Any,
 def _decode(topic: str, data: bytes, arrival: int) -> Any:
     type_name = topic_spec(topic).type
     try:
-        message = typestore().deserialize_cdr(data, type_name)
+        message = deserialize(data, type_name)
     except Exception as error:  # rosbags states no closed set of errors for damaged bytes
         raise ConvertError("bytes", f"{topic}: not a {type_name} ({type(error).__name__}: {error})") from None
     return topic_spec(topic).decode(message, arrival, topic)

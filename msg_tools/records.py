@@ -47,7 +47,7 @@ class CloudRecord:
         return np.column_stack([self.fields[name] for name in "xyz"]).astype(float)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class DiagnosticsRecord:
     """`/diagnostics`: per status its level (0 ok, 1 warning, 2 error), message and values."""
 

@@ -89,8 +89,8 @@ OUTPUTS = ("poses", "backbone", "tip", "reconstruction", "prior_map", "shape/pos
 
 def topic_spec(name: str) -> Topic:
     """The contract of a relative topic; `tracker/<sensor>` too. Raises ConvertError listing the valid names."""
-    key = TRACKER if name.startswith(TRACKER) and len(name) > len(TRACKER) else name
-    if key not in TOPICS:
+    key = TRACKER if name.startswith(TRACKER) else name
+    if key not in TOPICS or name == TRACKER:
         raise ConvertError("topic", f"no topic '{name}' in the contract; valid: "
                            + ", ".join("tracker/<sensor>" if topic == TRACKER else topic for topic in TOPICS))
     return TOPICS[key]
