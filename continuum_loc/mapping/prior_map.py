@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from continuum_loc.mapping.errors import MapError
+from continuum_loc.mapping.ply import write_ply
 from continuum_loc.mapping.voxel_index import VoxelIndex
 
 CLOUD_COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "planarity")
@@ -211,9 +212,7 @@ def _from_table(path: Path, table: np.ndarray, viewpoint) -> PriorMap:
 
 
 def _write_ply(prior: PriorMap, path: Path) -> None:
-    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {len(prior)}",
-                        *(f"property double {name}" for name in CLOUD_COLUMNS), "end_header", ""])
-    path.write_bytes(header.encode() + prior.table.astype("<f8").tobytes())
+    write_ply(path, dict(zip(CLOUD_COLUMNS, prior.table.T, strict=True)))
 
 
 def _read_ply(path: Path, spacing, viewpoint, seed) -> PriorMap:
