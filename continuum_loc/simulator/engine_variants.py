@@ -140,7 +140,7 @@ def _bolt() -> Sequence[Manifold]:
 
 
 def _nut() -> Sequence[Manifold]:
-    return (cylinder(0.020, 0.030, 6),)
+    return (cylinder(0.016, 0.024, 6),)
 
 
 def _ball() -> Sequence[Manifold]:

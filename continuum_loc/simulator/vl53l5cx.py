@@ -41,7 +41,7 @@ class Vl53l5cxSettings(Settings):
     fluctuation: float = Field(0.1, ge=0.0, description="relative noise of the signal (1 sigma)")
     crosstalk: float = Field(0.01, ge=0.0, lt=1.0, description="share of a zone's light that reaches each neighbour")
     noise_floor: float = Field(0.002, ge=0.0, description="noise beside Table I [m]")
-    wide_pulse: float = Field(0.04, gt=0.0, description="spread of depth in a zone that earns status 9 [m]")
+    wide_pulse: float = Field(0.03, gt=0.0, description="spread of depth in a zone that earns status 9 [m]")
     dropout: float = Field(0.002, ge=0.0, le=1.0, description="probability that a zone reports no target")
     inconsistent: float = Field(0.001, ge=0.0, le=1.0, description="probability of status 13")
 
