@@ -141,7 +141,7 @@ def test_a_capsule_is_met_at_its_surface_and_never_late(eye, a, b, radius, seed)
     stations = np.linspace(0.0, 4.0, 400)
     for ray, distance in zip(rays, entry, strict=True):
         if gap(eye) <= 1e-6:
-            assert np.isinf(distance) or gap(eye) > 0.0
+            assert np.isinf(distance) or gap(eye) > -1e-9  # on the surface, rounding decides
             continue
         before = eye + stations[stations < distance - 1e-6, None] * ray
         assert np.all(gap(before) > -1e-6)
