@@ -4,12 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from continuum_loc.evaluation.studies.simulator import first_mode
 from continuum_loc.robot import Ring, RobotDescription
 from continuum_loc.settings import SettingsError, parse_settings
 from continuum_loc.simulator import model as rod_model
 from continuum_loc.simulator.model import GRAVITY, SimulationDiverged, advance, build_model, settle, uniform_rod
 from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclengths
-from continuum_loc.simulator.reference import cosserat_shape, elastica_tip, first_frequency
+from continuum_loc.simulator.reference import cosserat_shape, elastica_tip
 
 LENGTH, EI, MASS = 1.0, 0.05, 0.02
 
@@ -80,29 +81,11 @@ def test_hanging_rod_stretches_by_half_its_weight_over_its_stiffness():
     assert stretch == pytest.approx(MASS * GRAVITY * LENGTH**2 / (2 * stiffness), rel=2e-3)
 
 
-def oscillation(time_step, links=24, duration=8.0):
-    """Damped first mode after a small static load is let go: (frequency [Hz], damping ratio)."""
-    model = uniform_rod(links, LENGTH, EI, MASS, supported=True, relaxation=0.05, time_step=time_step)
-    data = mujoco.MjData(model)
-    data.xfrc_applied[-1, 1] = 1e-3
-    settle(model, data, rest_speed=1e-7)
-    data.xfrc_applied[:] = 0.0
-    model.dof_damping[:] = 0.0  # what damping remains is the integrator's
-    y = np.array([(advance(model, data), data.body("tip").xpos[1])[1] for _ in range(round(duration / time_step))])
-    times = time_step * np.arange(1, len(y) + 1)
-    rising = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
-    crossings = times[rising] - y[rising] / (y[rising + 1] - y[rising]) * time_step
-    peaks = np.array([y[a:b].max() for a, b in zip(rising, rising[1:], strict=False)])
-    decrement = np.log(peaks[1] / peaks[-1]) / (len(peaks) - 2)
-    return 1.0 / np.diff(crossings).mean(), decrement / (2 * np.pi)
-
-
 @pytest.mark.parametrize("time_step", [0.002, 0.005])
 def test_first_mode_has_the_frequency_of_euler_and_bernoulli_and_the_integrators_damping(time_step):
-    frequency, damping = oscillation(time_step)
-    expected = first_frequency(EI, MASS, LENGTH)
-    assert frequency == pytest.approx(expected, rel=0.02)
-    assert damping == pytest.approx(np.pi * expected * time_step, rel=0.1)  # zeta = omega h / 2
+    found = first_mode(24, time_step)
+    assert found["frequency [Hz]"] == pytest.approx(found["Euler-Bernoulli [Hz]"], rel=0.02)
+    assert found["damping ratio"] == pytest.approx(found["omega h / 2"], rel=0.1)
 
 
 def test_a_released_rod_only_loses_energy():

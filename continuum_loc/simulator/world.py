@@ -218,6 +218,10 @@ class _Body:
         self._steps += 1
         return self._state(time)
 
+    def penetration(self) -> float:
+        """Depth of the deepest contact at present [m], 0 where nothing touches."""
+        return max(0.0, -float(self.data.contact.dist.min())) if self.data.ncon else 0.0
+
     def _command(self, time: float) -> None:
         command = self.path.command(time)
         drive = [command.insertion + self._lead * command.insertion_rate] if self._slides else []
