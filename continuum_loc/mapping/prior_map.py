@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -148,7 +149,8 @@ def _read_text(path: Path, spacing, viewpoint, seed) -> PriorMap:
     if comma:
         skipped = _check_csv_header(path)
     try:
-        table = np.loadtxt(path, delimiter="," if comma else None, skiprows=skipped, ndmin=2, comments="#")
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of an empty file, which is refused below
+            table = np.loadtxt(path, delimiter="," if comma else None, skiprows=skipped, ndmin=2, comments="#")
     except (ValueError, UnicodeDecodeError) as error:
         raise MapError(f"{path}: {_first_bad_line(path, skipped, comma) or error}") from None
     if table.size == 0:

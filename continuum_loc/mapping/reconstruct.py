@@ -127,7 +127,7 @@ def reconstruct(robot: RobotDescription, frames: Sequence[TofFrame], trajectory:
     T_map_ring, pose_covariance = trajectory.at(stack.stamps, rings)
     T_map_sensor = T_map_ring @ T_ring_sensor
     in_map = np.einsum("fij,fzj->fzi", T_map_sensor[:, :3, :3], stack.points) + T_map_sensor[:, None, :3, 3]
-    itself = stack.usable & _on_body(in_map, trajectory, stack.stamps, robot.radius + body_margin)
+    itself = stack.usable & _on_body(in_map, trajectory, stack.stamps, max(robot.radius + body_margin, 0.0))
     frame_of, zone = np.nonzero(stack.usable & ~itself)
     covariance = np.empty((len(frame_of), 3, 3))
     for start in range(0, len(frame_of), CHUNK):

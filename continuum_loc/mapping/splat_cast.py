@@ -8,6 +8,8 @@ from numba import njit
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import BLOCK, BLOCK_VOXELS, VoxelIndex, _find_slot, _pack
 
+COVER = 1.25  # spacings: 99.9 % of a sampled surface lies nearer than this to a sample
+
 
 def first_crossings(prior: PriorMap, index: VoxelIndex, origins: np.ndarray, directions: np.ndarray,
                     lengths: np.ndarray, *, radius: float | None = None, min_cos: float = 0.2,
@@ -15,10 +17,10 @@ def first_crossings(prior: PriorMap, index: VoxelIndex, origins: np.ndarray, dir
     """(rows (N,) of the map points first crossed, or -1; depths (N,) along the rays [m], or inf).
 
     origins (N, 3) [m]; directions (N, 3) unit; lengths (N,) how far to look [m]. radius: of the discs [m], by default
-    the map's spacing, at which blue-noise points leave no hole. min_cos: discs more oblique than this are passed by;
-    on an oriented map so are those seen from inside the solid.
+    a little more than the map's spacing, at which blue-noise points leave hardly a hole. min_cos: discs more oblique
+    than this are passed by; on an oriented map so are those seen from inside the solid.
     """
-    radius = prior.spacing if radius is None else radius
+    radius = COVER * prior.spacing if radius is None else radius
     rows, depths = np.full(len(origins), -1, np.int64), np.full(len(origins), np.inf)
     rays = (np.ascontiguousarray(part, dtype=np.float64) for part in (origins, directions, lengths))
     _cast(index.arrays, prior.normals, *rays, float(radius), float(min_cos), prior.oriented, rows, depths)
