@@ -44,8 +44,8 @@ def test_every_topic_of_the_contract_is_read_back_in_order_of_the_log(tmp_path):
     items = [("tof/points", _tof(1)), ("imu/data_raw", _imu(2)), ("imu/mag", FieldSample(3, "hall1", np.ones(3))),
              ("reconstruction", cloud), ("prior_map", CloudRecord(5, cloud.fields)),
              ("strain", StrainSample(SECOND, np.array([0.1]), np.zeros(1), np.ones(1))),
-             ("tracker/em1", TrackedPose(SECOND, "em1", T[0])), ("ground_truth/poses", TruthSample(SECOND + 1, T)),
-             ("poses", PosesRecord(SECOND + 2, T)), ("backbone", PathRecord(SECOND + 3, T))]
+             ("tracker/em1", TrackedPose(SECOND + 1, "em1", T[0])), ("ground_truth/poses", TruthSample(SECOND + 2, T)),
+             ("poses", PosesRecord(SECOND + 3, T)), ("backbone", PathRecord(SECOND + 4, T))]
     with BagWriter(tmp_path / "b") as writer:
         for topic, item in reversed(items):
             writer.write(topic, item)

@@ -31,11 +31,11 @@ def declare(node: Node, defaults: S, prefix: str = "") -> S:
 
     Raises SettingsError naming the parameter, its value and what is valid.
     """
-    for name, field, value in _leaves(defaults, prefix):
+    for name, field, value in leaves(defaults, prefix):
         try:
             node.declare_parameter(name, _ros_value(value), _descriptor(name, field, value))
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise SettingsError(f"parameter '{name}' ({field.description}; {_constraint(field)}): {error}") from None
+            raise SettingsError(f"parameter '{name}' ({field.description}; {constraint(field)}): {error}") from None
     return read(node, type(defaults), prefix)
 
 
@@ -73,11 +73,12 @@ def live_fields(model: type[Settings]) -> set[str]:
     return {name for name, field in model.model_fields.items() if (field.json_schema_extra or {}).get("live")}
 
 
-def _leaves(settings: Settings, prefix: str) -> Iterator[tuple[str, FieldInfo, Any]]:
+def leaves(settings: Settings, prefix: str) -> Iterator[tuple[str, FieldInfo, Any]]:
+    """(full name, field, value) of every field, nested groups included."""
     for name, field in type(settings).model_fields.items():
         value = getattr(settings, name)
         if isinstance(value, Settings):
-            yield from _leaves(value, f"{prefix}{name}.")
+            yield from leaves(value, f"{prefix}{name}.")
         else:
             yield prefix + name, field, value
 
@@ -104,7 +105,7 @@ def _plain(value: Any) -> Any:
 
 def _descriptor(name: str, field: FieldInfo, value: Any) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(name=name, description=field.description or "",
-                                     additional_constraints=_constraint(field))
+                                     additional_constraints=constraint(field))
     low, high = _limits(field)
     if isinstance(value, float) and (low, high) != (None, None):
         big = sys.float_info.max
@@ -126,7 +127,8 @@ def _limits(field: FieldInfo) -> tuple[float | None, float | None]:
     return low, high
 
 
-def _constraint(field: FieldInfo) -> str:
+def constraint(field: FieldInfo) -> str:
+    """The limits of a field in words; empty where it has none."""
     if get_origin(field.annotation) is Literal:
         return "one of: " + ", ".join(map(str, get_args(field.annotation)))
     signs = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))

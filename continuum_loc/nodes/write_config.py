@@ -1,0 +1,83 @@
+"""Write config/*.yaml from the typed settings, so that defaults are written down once:
+
+    python -m continuum_loc.nodes.write_config config
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from continuum_loc.estimator import EstimatorSettings
+from continuum_loc.nodes.parameters import constraint, leaves
+from continuum_loc.nodes.settings import (
+    EstimatorNodeSettings,
+    RecorderNodeSettings,
+    ReplayerNodeSettings,
+    ShapeNodeSettings,
+    SimulatorNodeSettings,
+)
+from continuum_loc.settings import Settings
+
+WIDTH = 112
+NODES: dict[str, Settings] = {"simulator": SimulatorNodeSettings(), "estimator": EstimatorNodeSettings(),
+                              "shape": ShapeNodeSettings(), "recorder": RecorderNodeSettings(),
+                              "replayer": ReplayerNodeSettings()}
+FILTER_NOTE = """\
+    # The filter itself. What stands here comes before the settings of `settings`; the numbers shown are the
+    # defaults of the library, not those tuned for a robot, so uncomment only what you mean to change.
+"""
+
+
+def config_text(node: str) -> str:
+    """The commented YAML of a node's parameters at their defaults."""
+    head = (f"# Parameters of node `{node}` at their defaults, by `python -m continuum_loc.nodes.write_config`.\n"
+            f"#   ros2 run continuum_loc {node} --ros-args --params-file {node}.yaml -p name:=value\n"
+            "# [live] may change while the node runs (`ros2 param set`); the others are refused then.\n"
+            "/**:\n  ros__parameters:\n")
+    body = "".join(_entries(NODES[node], "", ""))
+    if node == "estimator":
+        body += FILTER_NOTE + "".join(_entries(EstimatorSettings(), "filter.", "# "))
+    return head + body
+
+
+def _entries(settings: Settings, prefix: str, mark: str) -> Iterator[str]:
+    for name, field, value in leaves(settings, prefix):
+        limits = constraint(field)
+        live = bool((field.json_schema_extra or {}).get("live")) or bool(mark)
+        notes = [field.description or "", f"({limits})" if limits else "", "[live]" if live else ""]
+        yield _comment(" ".join(note for note in notes if note))
+        yield f"    {mark}{name}: {_text(value)}\n"
+
+
+def _comment(text: str) -> str:
+    lines, line = [], "    #"
+    for word in text.split():
+        if len(line) + len(word) + 1 > WIDTH:
+            lines.append(line)
+            line = "    #"
+        line += " " + word
+    return "".join(f"{item}\n" for item in (*lines, line))
+
+
+def _text(value: Any) -> str:
+    value = list(value) if isinstance(value, tuple) else value
+    if isinstance(value, float):
+        return repr(value)
+    return yaml.safe_dump(value, default_flow_style=True).removesuffix("...\n").strip()
+
+
+def main() -> None:
+    """Write all files into the folder given."""
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "config")
+    folder.mkdir(parents=True, exist_ok=True)
+    for node in NODES:
+        (folder / f"{node}.yaml").write_text(config_text(node))
+
+
+if __name__ == "__main__":
+    main()
