@@ -19,7 +19,6 @@ from numba import njit
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from continuum_loc.lie import so3_exp
 from continuum_loc.measurements import seconds
 from continuum_loc.settings import Settings
 
@@ -62,7 +61,10 @@ class GravityFilter:
 
     def rotation_at(self, stamp: int) -> np.ndarray:
         """R_map_imu carried from the last sample to `stamp` at the last rate."""
-        return self.R_map_imu @ so3_exp(self.rate * seconds(stamp, self.stamp))
+        R = self.R_map_imu.copy()
+        a, b, c = self.rate * seconds(stamp, self.stamp)
+        _turn(R, a, b, c)
+        return R
 
     @property
     def yaw_sigma(self) -> float:

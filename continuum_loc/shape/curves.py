@@ -15,11 +15,12 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
+from numba import njit
 
 CurveMethod = Literal["quadratic_bezier", "cubic_bezier", "kasa_arc"]
 PARALLEL = 1e-6  # sine of the angle below which two tangents count as parallel
 STRAIGHT = 1e-5  # sagitta over chord below which an arc is drawn as its line
-ARC_TOLERANCE = 7e-4  # m rms: points farther from their circle are no single arc
+ARC_TOLERANCE = 1.5e-4  # m rms: points farther from their circle are no single arc
 
 
 def fit_curve(points: np.ndarray, tangents: np.ndarray, method: CurveMethod = "kasa_arc", projected: bool = False,
@@ -72,7 +73,8 @@ def projected_cubic_bezier(points: np.ndarray, tangents: np.ndarray, samples: in
 
 def projected_kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
     """Eqs. 17-22."""
-    return lift(_arc_or_line(project(points), samples), points)
+    planar = project(points)
+    return lift(_arc_or_line(planar, kasa_circle(planar), samples), points)
 
 
 # The same in space
@@ -105,11 +107,10 @@ def kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarr
     _, size, axes = np.linalg.svd(points - centre, full_matrices=False)
     planar = (points - centre) @ axes[:2].T
     fit = kasa_circle(planar)
-    off_circle = np.linalg.norm(planar - fit[:2], axis=1) - fit[2] if fit is not None else size[1] / len(points)**0.5
-    rms = np.sqrt(np.mean(off_circle**2) + size[2] ** 2 / len(points))
-    if rms > ARC_TOLERANCE:
+    radial = size[1:2] if fit is None else np.hypot(*(planar - fit[:2]).T) - fit[2]
+    if (radial @ radial + size[2] ** 2) / len(points) > ARC_TOLERANCE**2:
         return biarc_chain(points, tangents, samples)
-    return centre + _arc_or_line(planar, samples) @ axes[:2]
+    return centre + _arc_or_line(planar, fit, samples) @ axes[:2]
 
 
 def biarc_chain(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
@@ -143,29 +144,36 @@ SPATIAL: dict[str, Fit] = {"quadratic_bezier": quadratic_bezier, "cubic_bezier":
 
 
 def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
-    """(3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20; None when straight."""
+    """(3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20; None when straight.
+
+    About the points' mean, eq. 20 falls apart into a 2x2 system for the centre and sigma = mean(x^2 + y^2).
+    """
     mean = planar.mean(axis=0)
-    scale = np.abs(planar - mean).max()
-    if scale == 0.0:
+    q = planar - mean
+    S = q.T @ q
+    square = (q * q).sum(axis=1)
+    determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    spread = S[0, 0] + S[1, 1]
+    if spread == 0.0:
         raise ValueError("all points of the curve coincide")
-    x, y = ((planar - mean) / scale).T  # centred and scaled, the normal matrix is as well conditioned as can be
-    D = np.column_stack([2.0 * x, 2.0 * y, np.ones_like(x)])
-    (xc, yc, sigma), _, rank, _ = np.linalg.lstsq(D, x * x + y * y, rcond=1e-10)
-    radius = np.sqrt(xc * xc + yc * yc + sigma)
-    if rank < 3 or 1.0 / (8.0 * radius) < STRAIGHT:
+    if determinant < 1e-16 * spread**2:
         return None
-    return np.array([mean[0] + scale * xc, mean[1] + scale * yc, scale * radius])
+    half = 0.5 * (q.T @ square)
+    centre = np.array([S[1, 1] * half[0] - S[0, 1] * half[1], S[0, 0] * half[1] - S[1, 0] * half[0]]) / determinant
+    radius = np.sqrt(centre @ centre + square.mean())
+    if np.sqrt(spread) / (8.0 * radius) < STRAIGHT:
+        return None
+    return np.array([*(mean + centre), radius])
 
 
-def _arc_or_line(planar: np.ndarray, samples: int) -> np.ndarray:
+def _arc_or_line(planar: np.ndarray, circle: np.ndarray | None, samples: int) -> np.ndarray:
     """(samples, 2) along the Kasa circle from the first point's polar angle to the last's, eqs. 21-22."""
-    circle = kasa_circle(planar)
     t = np.linspace(0.0, 1.0, samples)[:, None]
     if circle is None:
         return _line(planar, t)
     angle = np.unwrap(np.arctan2(planar[:, 1] - circle[1], planar[:, 0] - circle[0]))
     sweep = angle[0] + (angle[-1] - angle[0]) * t
-    return circle[:2] + circle[2] * np.hstack([np.cos(sweep), np.sin(sweep)])
+    return circle[:2] + circle[2] * np.concatenate([np.cos(sweep), np.sin(sweep)], axis=1)
 
 
 def _line(planar: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -222,9 +230,13 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # What is done with a curve
 
 
+@njit(cache=True)
 def arclength(points: np.ndarray) -> np.ndarray:
     """(C,) length along the polyline [m]."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    s = np.zeros(len(points))
+    for i in range(1, len(points)):
+        s[i] = s[i - 1] + np.sqrt(((points[i] - points[i - 1]) ** 2).sum())
+    return s
 
 
 def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
@@ -233,27 +245,35 @@ def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
     return np.column_stack([np.interp(np.asarray(fractions) * s[-1], s, column) for column in points.T])
 
 
+@njit(cache=True)
 def extended(points: np.ndarray, length: float) -> np.ndarray:
-    """The curve carried on to `length` [m] with the curvature of its end, or as it is when that long already."""
+    """The curve carried on to `length` [m] with the curvature of its last tenth, or as it is when that long already."""
     s = arclength(points)
     missing = length - s[-1]
     if missing <= 1e-9:
-        return points
-    back = at_fractions(points, np.array([1.0 - 0.2, 1.0 - 0.1, 1.0]))
-    before, after = back[1] - back[0], back[2] - back[1]
-    bend = np.cross(before, after)
-    step = 0.1 * s[-1]
-    angle = np.arctan2(np.linalg.norm(bend), before @ after) / step  # curvature of the end
-    axis = bend / max(np.linalg.norm(bend), 1e-300)
-    # The chord of the last step points along the tangent half a step before the end.
-    tangent = _rotate(after / np.linalg.norm(after), axis, 0.5 * angle * step)
-    run = np.linspace(0.0, missing, max(2, int(np.ceil(len(points) * missing / s[-1]))) + 1)[1:, None]
-    turn = angle * run
-    normal = np.cross(axis, tangent)
-    ahead = run * np.sinc(turn / np.pi) * tangent + run * np.sin(turn / 2) * np.sinc(turn / (2 * np.pi)) * normal
-    return np.vstack([points, points[-1] + ahead])
-
-
-def _rotate(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    """`vector`, perpendicular to `axis`, turned about it."""
-    return np.cos(angle) * vector + np.sin(angle) * np.cross(axis, vector)
+        return points.copy()
+    back = max(2, len(points) // 10)
+    a, b, c = points[-1 - 2 * (back // 2)], points[-1 - back // 2], points[-1]
+    first, second = b - a, c - b
+    bend = np.cross(first, second)
+    size = np.sqrt((bend**2).sum())
+    chord = np.sqrt((second**2).sum())
+    # Two chords of one circle: they turn by the arc between their middles; the tangent is half a chord further on.
+    turn = np.arctan2(size, (first * second).sum())
+    curvature = turn / chord
+    tangent, normal = second / chord, np.zeros(3)
+    if size > 1e-30:
+        normal = np.cross(bend / size, tangent)
+        tangent, normal = (np.cos(turn / 2) * tangent + np.sin(turn / 2) * normal,
+                           np.cos(turn / 2) * normal - np.sin(turn / 2) * tangent)
+    count = max(2, int(np.ceil(len(points) * missing / s[-1])))
+    out = np.empty((len(points) + count, 3))
+    out[:len(points)] = points
+    for i in range(count):
+        run = missing * (i + 1) / count
+        angle = curvature * run
+        forward, aside = run, 0.0
+        if angle > 1e-9:
+            forward, aside = np.sin(angle) / curvature, 2.0 * np.sin(angle / 2) ** 2 / curvature
+        out[len(points) + i] = c + forward * tangent + aside * normal
+    return out

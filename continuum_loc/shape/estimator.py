@@ -39,6 +39,9 @@ from continuum_loc.shape.magnet import FieldModel
 from continuum_loc.shape.position import PositionSolver
 from continuum_loc.shape.rest import MotionError, Rest, RestWindow
 
+MOVING = np.full(3, np.inf)
+STALE = 2.5  # sample periods: older readings do not belong to one time
+EULER_SIGMA = np.radians(1.0)  # the paper's filter states no uncertainty
 Status = Literal["taring", "tracking", "degraded", "faulty"]
 
 
@@ -58,10 +61,11 @@ class ShapeSettings(Settings):
     curve: CurveMethod = "kasa_arc"
     projected: bool = Field(False, description="the paper's projected curves instead of the spatial ones")
     curve_points: int = Field(61, ge=4, description="points along the curve up to the last module")
-    smoothing: float = Field(0.2, ge=0.0, description="time constant of the field's average while a module rests [s]")
-    still: float = Field(0.012, gt=0.0, description="a module turning slower rests [rad/s]")
+    smoothing: float = Field(0.5, ge=0.0, description="time constant of the field's average while a module rests [s]")
+    still: float = Field(0.006, gt=0.0, description="a module turning slower rests [rad/s]")
     silent_after: float = Field(0.1, gt=0.0, description="a module without samples for longer is silent [s]")
     frozen_after: int = Field(10, ge=2, description="as many equal readings in a row are a frozen sensor")
+    watch: float = Field(0.5, gt=0.0, description="between checks of the wiring by the joint fit [s]")
     misfit: float = Field(25.0, gt=1.0, description="normalised misfit of the joint fit from which wiring is suspect")
 
 
@@ -108,7 +112,7 @@ class _Stream:
         """Note a reading. False when it is no newer than the last."""
         if self.stamp is not None and stamp <= self.stamp:
             return False
-        same = self.reading is not None and np.array_equal(reading, self.reading, equal_nan=True)
+        same = self.reading is not None and reading.tobytes() == self.reading.tobytes()  # nan equals nan
         self.repeats = self.repeats + 1 if same else 1
         self.saturated = not (np.abs(reading) < full_scale).all()  # also where an axis is nan
         self.stamp, self.reading = stamp, reading
@@ -123,7 +127,31 @@ class _Module:
     filter: GravityFilter | EulerFilter
     imu: _Stream = field(default_factory=_Stream)
     hall: _Stream = field(default_factory=_Stream)
-    field_base: np.ndarray | None = None  # smoothed total field in the base frame [T]
+    field_base: np.ndarray | None = None  # total field in the base frame [T], averaged while the module rests
+    averaged: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Snapshot:
+    """All modules at one stamp: which are good (M,), R_base_module (M, 3, 3), total fields (M, 3) and the Earth's
+    (3,) in the base frame [T], and covariances of the rotations in base axes (M, 3, 3) [rad^2]."""
+
+    stamp: int
+    good: np.ndarray
+    R_base_module: np.ndarray
+    field_base: np.ndarray
+    earth: np.ndarray
+    attitude: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """Poses (M, 4, 4) with covariances (M, 6, 6), bounds (M, 3) and observability (M,)."""
+
+    T_base_module: np.ndarray
+    covariance: np.ndarray
+    bound: np.ndarray
+    observable: np.ndarray
 
 
 class ShapeEstimator:
@@ -141,6 +169,7 @@ class ShapeEstimator:
         self._index = {sensor.name: m for sensors in (robot.imu, robot.hall) for m, sensor in enumerate(sensors)}
         self._full_scale = (np.repeat([robot.imu_model.gyro_range, robot.imu_model.accel_range], 3),
                             np.asarray(robot.hall_model.saturation) + 0.5 * np.asarray(robot.hall_model.lsb))
+        self._gain = min(1.0, 1.0 / (robot.hall_model.rate * max(self.settings.smoothing, 1e-9)))
         self.reset()
 
     def reset(self) -> None:
@@ -153,6 +182,10 @@ class ShapeEstimator:
         self._window = RestWindow(self.robot)
         self._window_end: int | None = None
         self._next_due: int | None = None
+        self._next_watch: int | None = None
+        self._prior = straight_modules(self.robot)[:, :3, 3]
+        self._consistency = np.nan
+        self._wiring: dict[str, str] = {}
         self._modules = [_Module(ring, self._new_filter()) for ring in self.module_names]
         self._use(self._given or nominal_calibration(self.robot))
 
@@ -226,7 +259,10 @@ class ShapeEstimator:
             else:
                 module.filter.update(stamp, np.zeros(3), accel)
                 module.filter.bias = rest.gyro[m]
-        self.status, self.message, self._next_due = "tracking", "", stamp
+            if np.isfinite(rest.field[m]).all():
+                R_base_hall = self._R_base_module(m, stamp) @ self._R_module_hall[m]
+                module.field_base, module.averaged = R_base_hall @ (rest.field[m] - self._hall_offset[m]), rest.samples
+        self.status, self.message, self._next_due, self._next_watch = "tracking", "", stamp, stamp
 
     def _use(self, calibration: Calibration) -> None:
         """Set everything that follows from a calibration."""
@@ -258,11 +294,13 @@ class ShapeEstimator:
         m = self._index[sample.sensor]
         R_base_hall = self._R_base_module(m, sample.stamp) @ self._R_module_hall[m]
         field_base = R_base_hall @ (sample.field - self._hall_offset[m])
-        rate = module.filter.rate if isinstance(module.filter, GravityFilter) else np.full(3, np.inf)
-        if module.field_base is None or self.settings.smoothing == 0.0 or np.linalg.norm(rate) > self.settings.still:
-            module.field_base = field_base
+        rate = module.filter.rate if isinstance(module.filter, GravityFilter) else MOVING
+        if module.field_base is None or rate @ rate > self.settings.still**2:
+            module.field_base, module.averaged = field_base, 1
         else:
-            gain = 1.0 - np.exp(-1.0 / (self.robot.hall_model.rate * self.settings.smoothing))
+            # The mean of what came since the module rests, then a mean that forgets.
+            module.averaged += 1
+            gain = max(1.0 / module.averaged, self._gain)
             module.field_base = module.field_base + gain * (field_base - module.field_base)
 
     def _R_base_module(self, m: int, stamp: int) -> np.ndarray:
@@ -281,20 +319,27 @@ class ShapeEstimator:
 
     def _estimate(self, stamp: int) -> ShapeEstimate | None:
         self.faults = self._find_faults(stamp)
-        good = np.array([module.name not in self.faults for module in self._modules])
-        if not good.any():
+        now = self._snapshot(stamp)
+        if not now.good.any():
             self.status, self.message = "faulty", "no module can be used"
             return None
-        R = np.stack([self._R_base_module(m, stamp) for m in range(len(good))])
-        earth = self.T_map_base[:3, :3].T @ self.calibration.earth_field
-        attitude = self._attitude_covariance()
-        joint = self._joint(good, R, earth, attitude)
-        if joint.consistency > self.settings.misfit:
-            self._suspect_wiring(good, R, earth, attitude, joint)
-        T, covariance, bound, observable = joint.T_base_module, joint.covariance, np.zeros((len(good), 3), int), good
-        if self.settings.position == "modules":
-            T, covariance, bound, observable = self._by_module(good, R, earth, attitude, joint)
-        return self._describe(stamp, T, covariance, bound, observable, joint.consistency)
+        jointly = self.settings.position == "joint"
+        joint = None
+        if jointly or not now.good.all() or stamp >= self._next_watch:
+            joint = self._joint(now)
+            self._watch(now, joint)
+        solution = self._by_module(now, joint) if not jointly else _Solution(
+            joint.T_base_module, joint.covariance, np.zeros((len(now.good), 3), int), now.good)
+        self._prior = solution.T_base_module[:, :3, 3]
+        return self._describe(stamp, solution)
+
+    def _snapshot(self, stamp: int) -> _Snapshot:
+        modules = range(len(self._modules))
+        good = np.array([module.name not in self.faults for module in self._modules])
+        R_base_map = self.T_map_base[:3, :3].T
+        return _Snapshot(stamp, good, np.stack([self._R_base_module(m, stamp) for m in modules]),
+                         np.stack([self._modules[m].field_base if good[m] else np.zeros(3) for m in modules]),
+                         R_base_map @ self.calibration.earth_field, self._attitude_covariance(R_base_map))
 
     def _find_faults(self, stamp: int) -> dict[str, tuple[str, ...]]:
         """Silent, saturated and frozen modules."""
@@ -314,82 +359,87 @@ class ShapeEstimator:
                 found[module.name] = tuple(texts)
         return found
 
-    def _attitude_covariance(self) -> np.ndarray:
+    def _attitude_covariance(self, R_base_map: np.ndarray) -> np.ndarray:
         """(M, 3, 3) of the modules' rotations in base axes, mounting included [rad^2]."""
-        R_base_map = self.T_map_base[:3, :3].T
         mounting = self.calibration.mounting_sigma**2 * np.eye(3)
         filters = [module.filter for module in self._modules]
-        own = [f.covariance if isinstance(f, GravityFilter) else np.radians(1.0) ** 2 * np.eye(3) for f in filters]
-        return np.stack([R_base_map @ P @ R_base_map.T + mounting for P in own])
+        own = [f.covariance if isinstance(f, GravityFilter) else EULER_SIGMA**2 * np.eye(3) for f in filters]
+        return R_base_map @ np.stack(own) @ R_base_map.T + mounting
 
-    def _fields(self, good: np.ndarray) -> np.ndarray:
-        """(M, 3) smoothed total fields in the base frame; zero for modules that are left out."""
-        pairs = zip(self._modules, good, strict=True)
-        return np.stack([module.field_base if used else np.zeros(3) for module, used in pairs])
-
-    def _joint(self, good: np.ndarray, R: np.ndarray, earth: np.ndarray, attitude: np.ndarray,
-               order: tuple[int, ...] | None = None, sign: float = 1.0) -> BackboneFit:
+    def _joint(self, now: _Snapshot, order: tuple[int, ...] | None = None, sign: float = 1.0) -> BackboneFit:
         """The joint fit; `order` and `sign` try another wiring or a reversed magnet."""
-        order = list(order) if order is not None else list(range(len(good)))
-        in_module = np.einsum("mji,mj->mi", R, self._fields(good))[order]
+        order = list(range(len(now.good)) if order is None else order)
+        R, good = now.R_base_module, now.good
+        in_module = np.einsum("mji,mj->mi", R, now.field_base)
         # What the calibration leaves in the mounts turns every field, beside the sensor's own noise.
         turned = np.linalg.norm(in_module, axis=1, keepdims=True) * self.calibration.mounting_sigma
-        sigma = np.where(good[order, None], np.hypot(self.robot.hall_model.sigma, turned), np.inf)
-        information = np.linalg.inv(attitude)
-        information = np.where(good[:, None, None], R.swapaxes(1, 2) @ information @ R, 0.0)[order]
-        return self._backbone.solve(sign * in_module, np.broadcast_to(sigma, in_module.shape), sign * earth, R[order],
-                                    information)
+        sigma = np.where(good[:, None], np.hypot(self.robot.hall_model.sigma, turned), np.inf).repeat(3, axis=1)
+        information = np.where(good[:, None, None], R.swapaxes(1, 2) @ np.linalg.inv(now.attitude) @ R, 0.0)
+        return self._backbone.solve(sign * in_module[order], sigma[order], sign * now.earth, R[order],
+                                    information[order])
 
-    def _by_module(self, good: np.ndarray, R: np.ndarray, earth: np.ndarray, attitude: np.ndarray,
-                   joint: BackboneFit) -> tuple[np.ndarray, ...]:
+    def _by_module(self, now: _Snapshot, joint: BackboneFit | None) -> _Solution:
         """Eq. 10 for the good modules, the joint fit's pose for the others."""
         offset = np.array([self.robot.magnet.s, 0.0, 0.0])
-        prior = joint.T_base_module[:, :3, 3] - offset
-        # A module left out solves the field of its own prior, which changes nothing.
-        source = np.where(good[:, None], self._fields(good) - earth, self._positions.field(prior))
+        source, prior = now.field_base - now.earth, self._prior - offset
+        if joint is not None:
+            prior = joint.T_base_module[:, :3, 3] - offset
+            # A module left out solves for the field of its own prior, which changes nothing.
+            source = np.where(now.good[:, None], source, self._positions.field(prior))
         fit = self._positions.solve(source, prior)
-        own, observable = self._positions.covariance(fit.position, source, self.robot.hall_model.sigma, attitude)
-        T = joint.T_base_module.copy()
-        T[good, :3, :3] = R[good]
-        T[good, :3, 3] = fit.position[good] + offset
-        covariance = joint.covariance.copy()
+        own, observable = self._positions.covariance(fit.position, source, self.robot.hall_model.sigma, now.attitude)
+        R = now.R_base_module
+        T = np.zeros((len(R), 4, 4))
+        T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R, fit.position + offset, 1.0
         to_body = np.zeros_like(own)
         to_body[:, :3, :3] = to_body[:, 3:, 3:] = R.swapaxes(1, 2)
-        covariance[good] = (to_body @ own @ to_body.swapaxes(1, 2))[good]
-        for m in np.flatnonzero(good & fit.ambiguous):
+        covariance = to_body @ own @ to_body.swapaxes(1, 2)
+        if joint is not None:
+            T[~now.good], covariance[~now.good] = joint.T_base_module[~now.good], joint.covariance[~now.good]
+        for m in np.flatnonzero(now.good & fit.ambiguous):
             self.faults[self._modules[m].name] = ("position ambiguous",)
-        return T, covariance, fit.bound, observable & good
+        return _Solution(T, covariance, fit.bound, observable & now.good)
 
-    def _suspect_wiring(self, good: np.ndarray, R: np.ndarray, earth: np.ndarray, attitude: np.ndarray,
-                        joint: BackboneFit) -> None:
+    def _watch(self, now: _Snapshot, joint: BackboneFit) -> None:
+        """Judge the wiring by the joint fit, now and then, and only on readings of one time."""
+        self._consistency = joint.consistency
+        stale = seconds(now.stamp, min(min(module.imu.stamp, module.hall.stamp) for module in self._modules))
+        if now.stamp >= self._next_watch and stale < STALE / self.robot.hall_model.rate:
+            self._next_watch = now.stamp + nanoseconds(self.settings.watch)
+            self._wiring = self._suspects(now, joint) if joint.consistency > self.settings.misfit else {}
+
+    def _suspects(self, now: _Snapshot, joint: BackboneFit) -> dict[str, str]:
         """A joint fit this bad has a reason: try every order of the modules, and the magnet upside down."""
-        identity = tuple(range(len(good)))
-        trials = {(order, sign): self._joint(good, R, earth, attitude, order, sign).consistency
-                  for order in permutations(identity) for sign in (1.0, -1.0)}
+        names = self.module_names
+        trials = {(order, sign): self._joint(now, order, sign).consistency
+                  for order in permutations(range(len(names))) for sign in (1.0, -1.0)}
         (order, sign), best = min(trials.items(), key=lambda item: item[1])
         if best > 0.2 * joint.consistency:
-            texts = dict.fromkeys(identity, "does not fit the backbone")
-        elif sign < 0.0:
-            texts = dict.fromkeys(identity, "magnet upside down")
-        else:
-            texts = {which: f"swapped with {self._modules[place].name}"
-                     for place, which in enumerate(order) if place != which}
-        for m, text in texts.items():
-            name = self._modules[m].name
-            self.faults[name] = (*self.faults.get(name, ()), text)
+            return dict.fromkeys(names, "does not fit the backbone")
+        if sign < 0.0:
+            return dict.fromkeys(names, "magnet upside down")
+        return {names[which]: f"swapped with {names[place]}" for place, which in enumerate(order) if place != which}
 
-    def _describe(self, stamp: int, T_base_module: np.ndarray, covariance: np.ndarray, bound: np.ndarray,
-                  observable: np.ndarray, consistency: float) -> ShapeEstimate:
-        settings = self.settings
-        root = np.array([[self.robot.magnet.s, 0.0, 0.0]])
-        points = np.concatenate([root, T_base_module[:, :3, 3]]) - root
-        tangents = np.concatenate([[[1.0, 0.0, 0.0]], T_base_module[:, :3, 0]])
-        curve = fit_curve(points, tangents, settings.curve, settings.projected, settings.curve_points)
-        curve = extended(curve, self.robot.length - self.robot.magnet.s) + root
+    def _describe(self, stamp: int, solution: _Solution) -> ShapeEstimate:
+        for name, text in self._wiring.items():
+            self.faults[name] = (*self.faults.get(name, ()), text)
         self.status = "degraded" if self.faults else "tracking"
         self.message = "; ".join(f"{name}: {', '.join(texts)}" for name, texts in self.faults.items())
+        curve = self._curve(solution.T_base_module)
         R, p = self.T_map_base[:3, :3], self.T_map_base[:3, 3]
         yaw = [m.filter.yaw_sigma if isinstance(m.filter, GravityFilter) else np.inf for m in self._modules]
-        return ShapeEstimate(stamp, self.module_names, self.T_map_base @ T_base_module, covariance, curve @ R.T + p,
-                             arclength(curve) + self.robot.magnet.s, observable, bound, np.array(yaw), self.status,
-                             dict(self.faults), consistency)
+        return ShapeEstimate(stamp, self.module_names, self.T_map_base @ solution.T_base_module, solution.covariance,
+                             curve @ R.T + p, arclength(curve) + self.robot.magnet.s, solution.observable,
+                             solution.bound, np.array(yaw), self.status, dict(self.faults), self._consistency)
+
+    def _curve(self, T_base_module: np.ndarray) -> np.ndarray:
+        """(C, 3) from the magnet through the modules to the tip, in the base frame."""
+        settings, s = self.settings, self.robot.magnet.s
+        points, tangents = np.zeros((2, len(T_base_module) + 1, 3))
+        points[0, 0], points[1:] = s, T_base_module[:, :3, 3]
+        tangents[0, 0], tangents[1:] = 1.0, T_base_module[:, :3, 0]
+        points[:, 0] -= s
+        curve = extended(fit_curve(points, tangents, settings.curve, settings.projected, settings.curve_points),
+                         self.robot.length - s)
+        curve[:, 0] += s
+        return curve

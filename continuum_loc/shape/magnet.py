@@ -77,18 +77,29 @@ def invert_dipole(magnet: Magnet, field: np.ndarray) -> np.ndarray:
     and the position's angle theta off the axis: a quadratic with one root in 0..90 degrees for each beta.
     """
     field = np.asarray(field, dtype=float)
+    if field.shape[-1:] != (3,):
+        raise ValueError(f"fields must have shape (..., 3), got {field.shape}")
+    rows = np.ascontiguousarray(field.reshape(-1, 3))
     k = 1e-7 * dipole_moment(magnet)
-    towards = field * np.sign(k)
-    across = np.hypot(towards[..., 1], towards[..., 2])
-    along = towards[..., 0]
-    # The root of across * u^2 + 3 along * u - 2 across = 0, in the form that does not cancel for either sign.
-    root = np.sqrt(9.0 * along**2 + 8.0 * across**2)
-    theta = np.arctan2(np.where(along >= 0.0, 4.0 * across, root - 3.0 * along),
-                       np.where(along >= 0.0, root + 3.0 * along, 2.0 * across))
-    cosine, sine = np.cos(theta), np.sin(theta)
-    distance = np.cbrt(abs(k) * np.sqrt(3.0 * cosine**2 + 1.0) / np.linalg.norm(field, axis=-1))
-    azimuth = np.arctan2(towards[..., 2], towards[..., 1])
-    return distance[..., None] * np.stack([cosine, sine * np.cos(azimuth), sine * np.sin(azimuth)], axis=-1)
+    return np.array([invert_dipole_once(k, row) for row in rows]).reshape(field.shape)
+
+
+@njit(cache=True)
+def invert_dipole_once(k, field):
+    """`invert_dipole` of one field (3,), for k = mu_0 M / 4 pi."""
+    sign = 1.0 if k > 0.0 else -1.0
+    along, across = sign * field[0], math.hypot(field[1], field[2])
+    # The root of across u^2 + 3 along u - 2 across = 0, in the form that does not cancel for either sign.
+    root = math.sqrt(9.0 * along**2 + 8.0 * across**2)
+    if along >= 0.0:
+        theta = math.atan2(4.0 * across, root + 3.0 * along)
+    else:
+        theta = math.atan2(root - 3.0 * along, 2.0 * across)
+    cosine, sine = math.cos(theta), math.sin(theta)
+    size = math.sqrt((field**2).sum())
+    distance = (abs(k) * math.sqrt(3.0 * cosine**2 + 1.0) / size) ** (1.0 / 3.0)
+    cy, cz = (sign * field[1] / across, sign * field[2] / across) if across > 0.0 else (1.0, 0.0)
+    return distance * np.array([cosine, sine * cy, sine * cz])
 
 
 @njit(cache=True)

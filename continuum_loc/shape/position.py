@@ -16,9 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from continuum_loc.lie import hat
 from continuum_loc.robot import Magnet
-from continuum_loc.shape.magnet import FieldModel, evaluate_field, field_and_gradient, invert_dipole, magnet_parameters
+from continuum_loc.shape.magnet import (
+    FieldModel,
+    evaluate_field,
+    field_and_gradient,
+    invert_dipole,
+    invert_dipole_once,
+    magnet_parameters,
+)
 
 MAX_ITERATIONS = 60
 STEP_TOLERANCE = 1e-11  # m
@@ -71,10 +77,8 @@ class PositionSolver:
         field = np.ascontiguousarray(field, dtype=float)
         if field.shape != self.lower.shape or not np.isfinite(field).all():
             raise ValueError(f"expected a finite field of shape {self.lower.shape}, got {field.tolist()}")
-        closed_form = invert_dipole(self.magnet, field)
-        prior = closed_form if start is None else np.asarray(start, float)
-        starts = np.stack([prior, closed_form, -closed_form], axis=1)
-        return PositionFit(*_solve_all(self.parameters, field, starts, self.lower, self.upper))
+        prior = invert_dipole(self.magnet, field) if start is None else np.ascontiguousarray(start, dtype=float)
+        return PositionFit(*_solve_all(self.parameters, field, prior, self.lower, self.upper))
 
     def field(self, position: np.ndarray) -> np.ndarray:
         """(M, 3) field [T] of the model at `position` (M, 3) [m]."""
@@ -89,20 +93,35 @@ class PositionSolver:
         within its arclength (one sigma of half of it) keeps the result finite where the field says nothing;
         `observable` is whether the field narrows that prior at least fivefold in every direction.
         """
-        gradient = field_and_gradient(self.magnet, position, self.model)[1]
-        turn = -hat(field)
-        noise = sigma**2 * np.eye(3) + turn @ attitude @ turn.swapaxes(1, 2)
         prior_sigma = 0.5 * self.arclengths
-        weighted = np.linalg.solve(noise, gradient).swapaxes(1, 2)  # B'^T noise^-1
-        information = weighted @ gradient + np.eye(3) / prior_sigma[:, None, None]**2
-        P = np.linalg.inv(information)
-        cross = P @ weighted @ turn @ attitude  # a turned field moves the solution
-        covariance = np.block([[P, cross], [cross.swapaxes(1, 2), attitude]])
-        return covariance, np.sqrt(np.linalg.eigvalsh(P)[:, -1]) < 0.2 * prior_sigma
+        return _covariance(self.parameters, np.ascontiguousarray(position), np.ascontiguousarray(field), sigma**2,
+                           np.ascontiguousarray(attitude), prior_sigma)
 
 
 @njit(cache=True)
-def _solve_all(parameters, fields, starts, lower, upper):
+def _covariance(parameters, position, field, variance, attitude, prior_sigma):
+    modules = len(position)
+    covariance = np.empty((modules, 6, 6))
+    observable = np.empty(modules, np.bool_)
+    source, gradient, turn = np.empty(3), np.empty((3, 3)), np.zeros((3, 3))
+    for m in range(modules):
+        evaluate_field(parameters, position[m], source, gradient)
+        b = field[m]
+        turn[0, 1], turn[0, 2], turn[1, 2] = b[2], -b[1], b[0]  # db = phi x b
+        turn[1, 0], turn[2, 0], turn[2, 1] = -b[2], b[1], -b[0]
+        noise = variance * np.eye(3) + turn @ attitude[m] @ turn.T
+        weighted = np.linalg.solve(noise, gradient).T
+        P = np.linalg.inv(weighted @ gradient + np.eye(3) / prior_sigma[m] ** 2)
+        cross = P @ weighted @ turn @ attitude[m]  # a turned field moves the solution
+        covariance[m, :3, :3], covariance[m, 3:, 3:] = P, attitude[m]
+        covariance[m, :3, 3:], covariance[m, 3:, :3] = cross, cross.T
+        observable[m] = np.linalg.eigvalsh(P)[2] < (0.2 * prior_sigma[m]) ** 2
+    return covariance, observable
+
+
+@njit(cache=True)
+def _solve_all(parameters, fields, prior, lower, upper):
+    """From the prior first; where that is no exact fit, also from the dipole's closed form and its mirror image."""
     modules = fields.shape[0]
     position = np.empty((modules, 3))
     residual = np.empty(modules)
@@ -112,8 +131,11 @@ def _solve_all(parameters, fields, starts, lower, upper):
     iterations = np.zeros(modules, np.int64)
     for m in range(modules):
         best = math.inf
-        for k in range(starts.shape[1]):
-            p, cost, count, stationary = _solve_one(parameters, fields[m], starts[m, k], lower[m], upper[m])
+        start = prior[m]
+        for k in range(3):
+            if k > 0:
+                start = invert_dipole_once(parameters[0], fields[m]) * (1.0 if k == 1 else -1.0)
+            p, cost, count, stationary = _solve_one(parameters, fields[m], start, lower[m], upper[m])
             iterations[m] += count
             # An alternative replaces the prior's own optimum only by fitting clearly better.
             apart = math.sqrt(((p - position[m]) ** 2).sum())

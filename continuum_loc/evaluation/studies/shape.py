@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from continuum_loc.evaluation.study import Claim, at_least, at_most, write_study
-from continuum_loc.measurements import FieldSample, ImuSample, TruthSample, seconds
+from continuum_loc.measurements import FieldSample, ImuSample, TruthSample
 from continuum_loc.robot import RobotDescription, load_robot
 from continuum_loc.shape import ShapeEstimate, ShapeEstimator, ShapeSettings, curves
 from continuum_loc.shape.calibration import Calibration, calibrate, nominal_calibration
@@ -34,6 +34,7 @@ Row = dict[str, Any]
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     """Run the whole study into `out`: tables, figures 5-8 and the claims."""
     from continuum_loc.evaluation.studies import _shape_figures as figures
+    from continuum_loc.evaluation.studies._shape_faults import fault_rows
 
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -42,7 +43,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     grooves = _per_arm(_groove_rows, seeds, jobs)
     printed = _per_arm(_printed_rows, seeds[:2 if quick else 8], jobs)
     free = _per_arm(_free_rows, seeds[:2 if quick else 12], jobs) + _simulated_rows(robot, seed, quick)
-    faults = _fault_rows(robot, seed)
+    faults = fault_rows(robot, seed)
     tables = {"grooves": _summary(grooves, ("groove", "pipeline", "curve")),
               "printed": _summary(printed, ("plane", "groove", "mended", "curve")),
               "free_bending": _summary(free, ("shape", "curve", "form")), "faults": faults}
@@ -114,7 +115,8 @@ def _free_rows(seed: int) -> list[Row]:
     calibration = calibrate(robot, arm.calibration_rests())
     azimuth = np.random.default_rng(seed).uniform(-np.pi, np.pi)
     shapes = {"arc, R 80 mm": bent(robot, 12.5, azimuth), "S, 20 1/m": s_shape(robot, 20.0, azimuth),
-              "out of plane, 90 deg": out_of_plane(robot, 15.0), "out of plane, 180 deg": out_of_plane(robot, 15.0, np.pi)}
+              "out of plane, 90 deg": out_of_plane(robot, 15.0),
+              "out of plane, 180 deg": out_of_plane(robot, 15.0, np.pi)}
     rows = []
     for shape, strain in shapes.items():
         truth = arm.backbone(strain, SPAN * FRACTIONS)
@@ -123,7 +125,7 @@ def _free_rows(seed: int) -> list[Row]:
     return rows
 
 
-def _both_forms(points: np.ndarray, tangents: np.ndarray, truth: np.ndarray, **labels: Any) -> list[Row]:
+def _both_forms(points: np.ndarray, tangents: np.ndarray, truth: np.ndarray, /, **labels: Any) -> list[Row]:
     return [_row(curves.fit_curve(points, tangents, method, projected), truth, curve=method,
                  form="projected" if projected else "spatial", **labels)
             for method in METHODS for projected in (True, False)]
@@ -144,67 +146,6 @@ def _simulated_rows(robot: RobotDescription, seed: int, quick: bool) -> list[Row
                 rows += _both_forms(*points_and_tangents(robot, estimate), truth, shape=f"MuJoCo {name}, moving",
                                     seed=estimate.stamp)
     return rows
-
-
-def _fault_rows(robot: RobotDescription, seed: int) -> list[Row]:
-    """What the estimator says of each fault, and how long it takes from the fault to the first word."""
-    arm = Arm(robot, seed=seed)
-    calibration = calibrate(robot, arm.calibration_rests())
-    samples = arm.record(groove_motion(arm, bent(robot, 12.5)))
-    begin, late = samples[0].stamp, 3.0
-
-    def later(change: Callable[[Sample], Sample | None]) -> list[Sample]:
-        changed = (s if seconds(s.stamp, begin) < late else change(s) for s in samples)
-        return [s for s in changed if s is not None]
-
-    def of(sample: Sample, ring: str) -> bool:
-        return sample.sensor.startswith(ring)
-
-    frozen = {s.sensor: s for s in samples if seconds(s.stamp, begin) < late}
-    saturated = np.array([np.nan, 0.0, 0.0])
-    names = {"module1_imu": "module3_imu", "module1_hall": "module3_hall"}
-    names |= {b: a for a, b in names.items()}
-    reversed_arm = Arm(robot, seed=seed)
-    reversed_arm.magnet = arm.magnet.model_copy(update={"remanence": -arm.magnet.remanence})
-    upside_down = reversed_arm.record(groove_motion(reversed_arm, bent(robot, 12.5)))
-    shaken = arm.record(groove_motion(arm, bent(robot, 12.5), rest=0.3))
-    anyhow = ShapeSettings(start="anyhow")
-    cases: dict[str, tuple[str, float, ShapeSettings, Sequence[Sample]]] = {
-        "module silent": ("silent", late, ShapeSettings(), later(lambda s: None if of(s, "module2") else s)),
-        "module saturated": ("saturated", late, ShapeSettings(), later(
-            lambda s: FieldSample(s.stamp, s.sensor, saturated) if s.sensor == "module2_hall" else s)),
-        "module frozen": ("frozen", late, ShapeSettings(), later(lambda s: _frozen(s, frozen) if of(s, "module2") else s)),
-        "modules 1 and 3 swapped, tared straight": ("swapped", 0.0, ShapeSettings(), [_renamed(s, names) for s in samples]),
-        "modules 1 and 3 swapped, start anyhow": ("swapped", 0.0, anyhow, [_renamed(s, names) for s in samples]),
-        "magnet upside down, tared straight": ("upside down", 0.0, ShapeSettings(), upside_down),
-        "magnet upside down, start anyhow": ("upside down", 0.0, anyhow, upside_down),
-        "motion during taring": ("motion during taring", 0.0, ShapeSettings(), shaken),
-        "none": ("", np.inf, ShapeSettings(), samples),
-    }
-    return [_told(ShapeEstimator(robot, settings, calibration), stream, name, word, since)
-            for name, (word, since, settings, stream) in cases.items()]
-
-
-def _renamed(sample: Sample, names: dict[str, str]) -> Sample:
-    from dataclasses import replace
-
-    return replace(sample, sensor=names.get(sample.sensor, sample.sensor))
-
-
-def _frozen(sample: Sample, last: dict[str, Sample]) -> Sample:
-    from dataclasses import replace
-
-    return replace(last[sample.sensor], stamp=sample.stamp)
-
-
-def _told(estimator: ShapeEstimator, samples: Sequence[Sample], fault: str, word: str, since: float) -> Row:
-    """Run to the end; the first message and when it came. `word` has to be in it (no message for no fault)."""
-    for sample in samples:
-        estimator.process(sample)
-        if estimator.message:
-            after = seconds(sample.stamp, samples[0].stamp) - since
-            return {"fault": fault, "told": estimator.message, "after [s]": after, "right": bool(word and word in estimator.message)}
-    return {"fault": fault, "told": "", "after [s]": np.nan, "right": not word}
 
 
 # Shared parts
@@ -246,8 +187,8 @@ def errors(curve: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return 1e3 * np.linalg.norm(curves.at_fractions(curve, FRACTIONS) - truth, axis=1)
 
 
-def _row(curve: np.ndarray, truth: np.ndarray, **labels: Any) -> Row:
-    error = errors(curve, truth)
+def _row(points: np.ndarray, truth: np.ndarray, /, **labels: Any) -> Row:
+    error = errors(points, truth)
     return labels | {"mae": error.mean(), "max": error.max()}
 
 
