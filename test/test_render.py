@@ -1,0 +1,47 @@
+"""The ray-cast pictures show what geometry says: a sphere's disc, its section, and the parts of a robot."""
+
+import numpy as np
+import pytest
+
+from continuum_loc.robot import load_robot
+from continuum_loc.simulator.render import BODY, RING, SKY, Camera, Shape, render, robot_shapes
+
+trimesh = pytest.importorskip("trimesh")
+RED = (1.0, 0.0, 0.0)
+
+
+def sphere(radius=0.5):
+    mesh = trimesh.creation.icosphere(5, radius)
+    return Shape(np.asarray(mesh.vertices), np.asarray(mesh.faces), RED)
+
+
+def covered(image):
+    return np.any(image != np.round(255 * np.array(SKY)), axis=-1)
+
+
+def test_a_sphere_covers_the_disc_of_its_tangent_cone():
+    camera = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), fov_deg=45.0, width=200, height=200)
+    image = render([sphere()], camera)
+    tangent = np.tan(np.arcsin(0.5 / 2.0)) / np.tan(np.radians(22.5))  # of half the picture's width
+    assert covered(image).mean() == pytest.approx(np.pi * tangent**2 / 4.0, rel=0.02)
+    assert image[100, 100, 0] > 100 and np.all(image[100, 100, 1:] == 0)
+
+
+def test_a_section_cuts_away_what_lies_before_it():
+    whole = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), width=60, height=60)
+    beyond = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), width=60, height=60, section=0.6)
+    assert covered(render([sphere()], whole)).any() and not covered(render([sphere()], beyond)).any()
+
+
+def test_a_robot_has_a_body_a_band_per_ring_and_a_box_per_sensor():
+    robot = load_robot("engine")
+    backbone = np.tile(np.eye(4), (31, 1, 1))
+    backbone[:, 0, 3] = np.linspace(0.0, robot.length, 31)
+    rings = np.tile(np.eye(4), (5, 1, 1))
+    rings[:, 0, 3] = robot.ring_arclengths
+    shapes = robot_shapes(robot, backbone, rings)
+    assert [shape.colour for shape in shapes].count(BODY) == 1
+    assert [shape.colour for shape in shapes].count(RING) == 5 and len(shapes) == 1 + 5 + 16
+    body = trimesh.Trimesh(shapes[0].vertices, shapes[0].faces)
+    assert body.is_watertight
+    assert abs(body.volume) == pytest.approx(np.pi * robot.radius**2 * robot.length, rel=0.02)
