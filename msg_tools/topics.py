@@ -60,16 +60,16 @@ def _tracker(message: Any, arrival: int | None, where: str) -> Any:
 
 
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-# The depth of an input covers a quarter of a second of all its sensors together, so that one slow moment loses nothing.
+# The depth of an input covers 4 s of all its sensors together, so that a slow moment loses nothing.
 TOPICS: dict[str, Topic] = {
-    "tof/points": Topic("sensor_msgs/msg/PointCloud2", convert.tof_message, _read(convert.tof_frame), depth=128),
-    "imu/data_raw": Topic("sensor_msgs/msg/Imu", convert.imu_message, _read(convert.imu_sample), depth=256),
-    "imu/mag": Topic("sensor_msgs/msg/MagneticField", convert.field_message, _read(convert.field_sample), depth=128),
-    "strain": Topic("std_msgs/msg/Float64MultiArray", convert.strain_message, _strain, depth=32),
-    TRACKER: Topic(_POSE, convert.tracker_message, _tracker, depth=64),
+    "tof/points": Topic("sensor_msgs/msg/PointCloud2", convert.tof_message, _read(convert.tof_frame), depth=1024),
+    "imu/data_raw": Topic("sensor_msgs/msg/Imu", convert.imu_message, _read(convert.imu_sample), depth=2048),
+    "imu/mag": Topic("sensor_msgs/msg/MagneticField", convert.field_message, _read(convert.field_sample), depth=1024),
+    "strain": Topic("std_msgs/msg/Float64MultiArray", convert.strain_message, _strain, depth=128),
+    TRACKER: Topic(_POSE, convert.tracker_message, _tracker, depth=512),
     "joint_states": Topic("sensor_msgs/msg/JointState", convert.encoder_message, _read(convert.encoder_sample),
-                          depth=64),
-    "ground_truth/poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.truth_sample), depth=64),
+                          depth=256),
+    "ground_truth/poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.truth_sample), depth=512),
     "poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.poses_record)),
     "backbone": Topic("nav_msgs/msg/Path", _path, _read(convert.path_record)),
     "tip": Topic("nav_msgs/msg/Odometry", lambda make, item: convert.tip_message(make, tip_of(item), "tip"),

@@ -117,8 +117,10 @@ def run_live(folder: str | Path, *, robot: str = "engine", scene: str = "S0", tr
 
     try:
         tell("starting the nodes", 0.0)
-        recorder = start("recorder", bag=str(folder / "bag"))
-        estimator = start("estimator", map=str(prior_map), settings=settings, **common)
+        # The simulator publishes reliably, so on a busy machine nothing need be lost on the way.
+        recorder = start("recorder", bag=str(folder / "bag"), reliable_inputs=True)
+        estimator = start("estimator", map=str(prior_map), settings=settings,
+                          **{"intake.reliable_inputs": True}, **common)
         recorder.await_log("recording", START_LIMIT)
         estimator.await_log("ready:", START_LIMIT)
         # The simulator holds its data back until estimator and recorder both listen to it.

@@ -32,6 +32,7 @@ def declare(node: Node, defaults: S, prefix: str = "") -> S:
     Raises SettingsError naming the parameter, its value and what is valid.
     """
     for name, field, value in leaves(defaults, prefix):
+        _accept_whole_number(node, name, value)
         try:
             node.declare_parameter(name, _ros_value(value), _descriptor(name, field, value))
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
@@ -81,6 +82,13 @@ def leaves(settings: Settings, prefix: str) -> Iterator[tuple[str, FieldInfo, An
             yield from leaves(value, f"{prefix}{name}.")
         else:
             yield prefix + name, field, value
+
+
+def _accept_whole_number(node: Node, name: str, default: Any) -> None:
+    """`rate: 10` means 10.0 where a float is declared; rclpy would refuse it."""
+    given = node._parameter_overrides.get(name)
+    if isinstance(default, float) and given is not None and given.type_ == Parameter.Type.INTEGER:
+        node._parameter_overrides[name] = Parameter(name, Parameter.Type.DOUBLE, float(given.value))
 
 
 def _nested(node: Node, model: type[Settings], prefix: str, changed: dict[str, Any]) -> dict[str, Any]:

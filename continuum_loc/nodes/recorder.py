@@ -16,7 +16,6 @@ from continuum_loc.nodes.runtime import PackageNode, input_qos, run, write_summa
 from continuum_loc.nodes.settings import RecorderNodeSettings
 from continuum_loc.settings import SettingsError
 from msg_tools.bag import BagWriter, split_topic
-from msg_tools.factory import ros_messages
 from msg_tools.topics import TOPICS, TRACKER, topic_spec
 
 WATCH_PERIOD = 0.5  # s; trackers are found on the graph, as only the robot description could name them before
@@ -70,7 +69,7 @@ class RecorderNode(PackageNode):
         if spec.latched:  # a latched message of before our start is only given to those who ask for it
             qos = input_qos(spec, True)
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        self.create_subscription(ros_messages().resolve(spec.type), topic, partial(self._receive, topic), qos, raw=True)
+        self.listen(spec.type, topic, partial(self._receive, topic), qos, raw=True)
         self._subscribed.add(topic)
 
     def _find_trackers(self) -> None:

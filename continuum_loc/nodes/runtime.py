@@ -21,6 +21,7 @@ from rclpy.task import Future
 from continuum_loc.nodes.parameters import declare, refuse_unknown
 from continuum_loc.settings import Settings, SettingsError
 from msg_tools.errors import BagError, ConvertError
+from msg_tools.factory import ros_messages
 from msg_tools.topics import Topic
 
 BAD_INPUT = 2
@@ -41,6 +42,22 @@ class PackageNode(Node):
 
     def close(self) -> None:
         """Stop threads, write files. Called once, after the last callback."""
+
+    def listen(self, type_name: str, topic: str, callback: Callable[[Any], None], qos: QoSProfile,
+               raw: bool = False) -> None:
+        """Subscribe, taking all that waits at each wake-up.
+
+        An executor takes one message of each topic in turn, so that in a backlog the busy topics fall behind the
+        quiet ones; and it builds a wait set for each.
+        """
+        def take(message: Any) -> None:
+            while message is not None:
+                callback(message)
+                with subscription.handle:
+                    taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                message = None if taken is None else taken[0]
+
+        subscription = self.create_subscription(ros_messages().resolve(type_name), topic, take, qos, raw=raw)
 
     def now(self) -> int:
         """The node's clock in integer nanoseconds (0 while a simulated clock has not begun)."""

@@ -79,8 +79,8 @@ class WorkerNode(PackageNode):
         guard(self, self._change)
         for topic in self._input_topics():
             spec = topic_spec(topic)
-            self.create_subscription(ros_messages().resolve(spec.type), topic, partial(self._receive, topic),
-                                     input_qos(spec, self.settings.intake.reliable_inputs))
+            self.listen(spec.type, topic, partial(self._receive, topic),
+                        input_qos(spec, self.settings.intake.reliable_inputs))
         self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
         self.get_logger().info(f"ready: robot '{self.robot.name}'")
