@@ -109,7 +109,7 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
     from continuum_loc.robot import load_robot
 
     estimator = make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene), settings)
-    resolved = configuration(trial, estimator)
+    resolved = configuration(trial, estimator=estimator.settings)
     key = hashlib.sha256(json.dumps([plain(resolved), asdict(trial)], sort_keys=True).encode()).hexdigest()
     summary_file = folder / "summary.json"
     if summary_file.is_file():

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.evaluation.metrics import errors, summarise
 from continuum_loc.evaluation.replay import ReplayResult, place_points, samples_of
 from continuum_loc.evaluation.replay import replay as run_replay
@@ -17,7 +18,7 @@ from continuum_loc.evaluation.runs import distribution, load_run, new_run, save_
 from continuum_loc.evaluation.study import Claim, at_least, at_most
 from continuum_loc.evaluation.tracks import BASE, Track
 from continuum_loc.evaluation.trials import Trial, configuration, make_filter, scene_map_file
-from continuum_loc.mapping.prior_map import PriorMap, load_map
+from continuum_loc.mapping.prior_map import load_map
 from continuum_loc.measurements import TofFrame
 from continuum_loc.robot import RobotDescription, load_robot
 
@@ -39,7 +40,7 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
     """Run `trial` live into a new folder under `root`, replay its bag twice, and write the report."""
     from continuum_loc.nodes.live import run_live
 
-    robot = load_robot(trial.robot)
+    robot, settings = load_robot(trial.robot), load_estimator_settings(load_robot(trial.robot).name)
     tell("building the scene and its prior map (kept for the next time)")
     map_file = scene_map_file(trial.scene)
     folder = new_run("demo", root)
@@ -48,24 +49,22 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
                     tof_fidelity=trial.fidelity, progress=lambda stage, share: tell(f"{stage} {100 * share:.0f} %"))
     bag = (folder / "live" / "bag").rename(folder / "bag")
     prior = load_map(map_file)
-    replays = [_replayed(bag, robot, prior, tell, number) for number in (1, 2)]
+    replays = []
+    for number in (1, 2):
+        tell(f"replaying the bag without ROS, run {number} of 2")
+        replays.append(run_replay(bag, make_filter(robot, prior, settings)))
     shown = with_live_poses(replays[0], recorded_track(bag, robot), bag, robot)
     shown = replace(shown, latency_seconds=np.array(live.latencies_s), counts={**live.counts, "lost": live.lost})
     identical = replays[0].digest == replays[1].digest
     claims = demo_claims(shown, live.lost, identical)
     summary = save_run(folder, shown, kind="demo", seed=trial.seed,
-                       configuration=configuration(trial, make_filter(robot, prior), map={"file": map_file}, bag=bag),
+                       configuration=configuration(trial, estimator=settings, map={"file": map_file}, bag=bag),
                        extra={"claims": claims, "live_step_ms": live.step_ms, "lost_messages": live.lost,
                               "replay": replay_summary(shown, replays[0], identical)})
     tell("writing the report")
     run = load_run(folder)
     write_report(run, context_of(run))
     return DemoOutcome(folder, bag, summary, claims, identical)
-
-
-def _replayed(bag: Path, robot: RobotDescription, prior: PriorMap, tell: Tell, number: int) -> ReplayResult:
-    tell(f"replaying the bag without ROS, run {number} of 2")
-    return run_replay(bag, make_filter(robot, prior))
 
 
 def recorded_track(bag: Path, robot: RobotDescription) -> Track:

@@ -148,12 +148,9 @@ def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[
     return counts
 
 
-def configuration(trial: Trial, estimator: Filter | None = None, **more: Any) -> dict[str, Any]:
-    """Everything that a trial was made from, for its run folder."""
-    resolved = {"robot": load_robot(trial.robot), "scene": trial.scene, "trajectory": trial.trajectory,
-                "map": {"scene": trial.map_scene or trial.scene, "points": MAP_POINTS}, "profile": trial.profile,
-                "tof_fidelity": trial.fidelity, "disturbed": trial.disturbed, "seed": trial.seed,
-                "duration": trial.duration}
-    if estimator is not None:
-        resolved["estimator"] = estimator.settings
-    return {**resolved, **more}
+def configuration(trial: Trial, **more: Any) -> dict[str, Any]:
+    """Everything that a trial was made from, for its run folder; `more` adds to it."""
+    return {"robot": load_robot(trial.robot), "scene": trial.scene, "trajectory": trial.trajectory,
+            "map": {"scene": trial.map_scene or trial.scene, "points": MAP_POINTS}, "profile": trial.profile,
+            "tof_fidelity": trial.fidelity, "disturbed": trial.disturbed, "seed": trial.seed,
+            "duration": trial.duration, **more}
