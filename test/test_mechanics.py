@@ -3,6 +3,9 @@
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from continuum_loc.evaluation.studies.simulator import first_mode
 from continuum_loc.robot import Ring, RobotDescription
@@ -133,6 +136,19 @@ def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
     mujoco.mj_forward(model, data)
     assert LENGTH - data.body("node40").xpos[0] == pytest.approx(8.0 * LENGTH / stiffness, rel=1e-3)
     np.testing.assert_allclose(data.ten_length, LENGTH * (1.0 - 8.0 / stiffness), rtol=1e-3)
+
+
+@given(arrays(float, (3, 2), elements=st.floats(-2.0, 2.0)), st.floats(0.0, 20.0))
+def test_tensions_add_up_to_the_moments_wanted_in_every_stretch(moments, pretension):
+    """A tension F at (r_y, r_z) bends every stretch up to its end by F (-r_z, r_y)."""
+    plant = load_plant("engine")
+    tension = plant.tension_for_moments(moments, pretension)
+    ends = np.repeat([group.end for group in plant.tendons], 3)
+    angle = np.radians(np.concatenate([group.azimuth_deg for group in plant.tendons]))
+    arms = plant.tendons[0].radius * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+    for stretch, group in enumerate(plant.tendons):
+        reach = ends >= group.end
+        np.testing.assert_allclose((tension[reach, None] * arms[reach]).sum(axis=0), moments[stretch], atol=1e-9)
 
 
 def test_tensions_keep_the_pretension_and_a_moment_out_of_reach_is_refused():

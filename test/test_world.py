@@ -257,6 +257,27 @@ def test_leaving_a_sensor_out_does_not_change_the_others():
     assert len(kept) == len(less) < len(full) and all(same(a, b) for a, b in zip(kept, less, strict=True))
 
 
+def test_tof_ranges_are_those_of_the_true_pose_at_their_own_stamps(scene):
+    """Rays cast anew from the true ring poses meet the scene where the frame says, in motion and between steps."""
+    from continuum_loc.simulator.raycast import RayCaster
+
+    robot = load_robot("engine")
+    silent = robot.tof_model.model_copy(update={"noise_coefficient": (1e-9,) * 3})
+    robot = robot.model_copy(update={"tof_model": silent, "strain": None, "imu": ()})
+    world, caster, errors = World(robot, scene, "t2"), RayCaster(scene), []
+    for sample in world.run(2.4):
+        if type(sample) is TofFrame and sample.stamp > 2.0 * NANOSECONDS:
+            T_map_ring = world.full_state(robot.sensor_arclength(sample.sensor))
+            T_map_sensor = T_map_ring @ robot.sensor(sample.sensor).mount.T_ring_sensor
+            rays = silent.directions @ T_map_sensor[:3, :3].T
+            distance = caster.cast(np.broadcast_to(T_map_sensor[:3, 3], rays.shape), rays)[0]
+            hit = np.isfinite(sample.ranges)
+            errors.append(sample.ranges[hit] - distance[hit])
+    errors = np.concatenate(errors)
+    assert len(errors) > 5000
+    assert np.mean(np.abs(errors) < 1e-5) > 0.99  # the rest are returns from the robot's own body
+
+
 def test_imu_noise_is_white_gaussian_of_the_stated_sigma():
     robot = load_robot("engine")
     model = ImuSensors(robot.imu_model, robot.imu, GRAVITY, np.random.default_rng(1))
