@@ -56,7 +56,8 @@ def vertices_of(solid: Manifold) -> np.ndarray:
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
     """The solid inside a closed mesh. Raises ValueError where the mesh is not a closed, oriented surface."""
-    solid = Manifold(Mesh64(np.ascontiguousarray(vertices, dtype=np.float64), faces.astype(np.uint64)))
+    # Copies: the binding takes no read-only arrays.
+    solid = Manifold(Mesh64(np.array(vertices, dtype=np.float64, order="C"), faces.astype(np.uint64)))
     if solid.is_empty():
         raise ValueError(f"not a closed, oriented surface: {solid.status()}")
     return solid
