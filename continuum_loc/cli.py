@@ -174,22 +174,32 @@ def evaluate(name: Annotated[str | None, typer.Argument(help="study; without one
 def bench(quick: Annotated[bool, typer.Option("--quick", help="few repeats, small sizes")] = False,
           out: Annotated[Path | None, typer.Option(help="folder of the results; default: a new run")] = None,
           only: Annotated[str | None, typer.Option(help="one benchmark by name")] = None,
-          check: Annotated[bool, typer.Option("--check", help="compare with the committed baseline")] = False) -> None:
+          check: Annotated[bool, typer.Option("--check", help="compare with the committed baseline")] = False,
+          baseline: Annotated[bool, typer.Option("--baseline", help="commit to these ratios")] = False,
+          peers: Annotated[bool, typer.Option(help="install what we are compared with")] = True) -> None:
     """Measure everything a user waits for beside what they would use instead, as ratios with spread.
 
     Example: `continuum-loc bench --quick --only lookup`
     """
-    from continuum_loc.evaluation.bench import run_bench
+    from continuum_loc.evaluation import bench as benches
     from continuum_loc.evaluation.runs import new_run
 
-    outcome = run_bench(out or new_run("bench"), quick, only, _each)
-    console.print(outcome.table)
+    names = benches.bench_names()
+    if peers:
+        benches.install_peers()
+    outcome = benches.run_bench(out or new_run("bench"), quick, only, _each)
+    console.print(_text_table(benches.table(outcome.rows)))
+    if outcome.claims:
+        console.print(_claims_table(outcome.claims))
     for line in outcome.failures:
-        errors.print(f"[bold red]failed:[/] {line}", highlight=False)
+        errors.print(f"[bold red]failed:[/] {escape(line)}", highlight=False)
+    if baseline:
+        benches.write_baseline(outcome.rows)
     regressions = outcome.regressions() if check else []
     for line in regressions:
-        errors.print(f"[bold red]slower than the baseline:[/] {line}", highlight=False)
-    raise typer.Exit(FAILED if outcome.failures or regressions else OK)
+        errors.print(f"[bold red]slower than the baseline:[/] {escape(line)}", highlight=False)
+    held = all(claim.holds for claim in outcome.claims) or quick  # sizes and repeats of --quick prove no bound
+    raise typer.Exit(OK if names and held and not (outcome.failures or regressions) else FAILED)
 
 
 @map_app.command("build")
@@ -295,6 +305,15 @@ def _claims_table(claims: list[Claim]) -> Any:
     for claim in claims:
         verdict = "[green]holds[/]" if claim.holds else "[bold red]FAILS[/]"
         table.add_row(claim.name, f"{claim.value:.4g}", claim.unit, claim.bound, verdict)
+    return table
+
+
+def _text_table(rows: list[dict[str, str]]) -> Any:
+    from rich.table import Table
+
+    table = Table(*(rows[0] if rows else ()), show_edge=False)
+    for row in rows:
+        table.add_row(*(escape(str(cell)) for cell in row.values()))
     return table
 
 
