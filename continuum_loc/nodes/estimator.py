@@ -12,8 +12,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
-from continuum_loc.estimator import SlidingWindowFilter, load_estimator_settings
+from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter, load_estimator_settings
 from continuum_loc.estimator.estimate import Estimate
+from continuum_loc.estimator.settings import PRESETS_FOLDER
 from continuum_loc.measurements import EncoderSample, Measurement, TofFrame, nanoseconds
 from continuum_loc.nodes import parameters
 from continuum_loc.nodes.memory import SeenScene, Trajectory
@@ -39,8 +40,7 @@ class EstimatorNode(WorkerNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("estimator", EstimatorNodeSettings(), **options)
-        preset = load_estimator_settings(self.settings.settings or self.robot.name)
-        self.filter_settings = parameters.declare(self, preset, FILTER)
+        self.filter_settings = parameters.declare(self, self._preset(), FILTER)
         self.check_parameters()
         self.prior_map = self._load_map()
         self.filter = self._new_filter(self.robot)
@@ -192,6 +192,15 @@ class EstimatorNode(WorkerNode):
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
         return SlidingWindowFilter(robot, self.prior_map, self.filter_settings)
+
+    def _preset(self) -> EstimatorSettings:
+        """The settings asked for, else those bundled for this robot, else the library's defaults."""
+        bundled = (PRESETS_FOLDER / f"{self.robot.name}.yaml").is_file()
+        if not self.settings.settings and not bundled:
+            self.get_logger().warning(f"no settings are tuned for robot '{self.robot.name}': using the defaults "
+                                      "(parameter `settings`; `continuum-loc tune` finds better ones)")
+            return EstimatorSettings()
+        return load_estimator_settings(self.settings.settings or self.robot.name)
 
     def _load_map(self) -> Any:
         if not self.settings.map:

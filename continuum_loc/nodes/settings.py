@@ -34,7 +34,8 @@ class EstimatorNodeSettings(Settings):
 
     robot: str = Field("engine", description="robot description: a bundled name or a YAML file")
     map: str = Field("", description="prior map: npz, PLY, PCD, XYZ, CSV or a mesh; empty for none")
-    settings: str = Field("", description="filter settings: a bundled name or a YAML file; empty for the robot's own")
+    settings: str = Field("", description="filter settings: a bundled name or a YAML file; empty for the robot's "
+                                              "own, or else the defaults")
     frame_prefix: str = Field("", description="put before every frame name except `map` (several robots)")
     publish_tf: bool = _live(True, description="map -> base_link -> rings, where tf2_msgs is installed")
     map_points: int = Field(100_000, ge=0, description="most points of the published `prior_map`; 0 for all")
