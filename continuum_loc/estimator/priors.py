@@ -18,6 +18,7 @@ from continuum_loc.robot import RobotDescription
 
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
 BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
+MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in motion
 
 
 class Priors:
@@ -50,15 +51,19 @@ class Priors:
             rate[0] = 1.0
         self.base_information, self.base_rate_information = sigma**-2.0, rate**-2.0
 
-    def start(self, column: Column) -> Message:
-        """The first column's own factors, linearised there: what is known before any measurement."""
+    def start(self, column: Column, moving: bool = False) -> Message:
+        """The first column's own factors, linearised there: what is known before any measurement.
+
+        `moving` loosens the velocity, for a body found in the middle of its motion.
+        """
+        velocity = self.initial_velocity * (MOVING_FACTOR**-2 if moving else 1.0)
         D = self.grid.dim
         H, g = np.zeros((D, D)), np.zeros(D)
         self._add_column(H, g, column, 1.0)
         for n in range(self.grid.nodes):
             at = slice(NODE_DIM * n + VELOCITY, NODE_DIM * n + VELOCITY + 6)
-            H[at, at] += np.diag(self.initial_velocity)
-            g[at] += self.initial_velocity * column.velocity[n]
+            H[at, at] += np.diag(velocity)
+            g[at] += velocity * column.velocity[n]
         biases = np.arange(self.grid.bias_offset, D)
         H[biases, biases] += self.bias_information
         return Message(H, g)

@@ -95,10 +95,19 @@ class RecoverySettings(Settings):
     """Noticing that the filter is lost, and finding back."""
 
     enabled: bool = True
-    min_inliers: float = Field(0.5, ge=0.0, le=1.0, description="share of fitting zones below which a body is suspect")
-    patience: float = Field(0.4, ge=0.0, description="time that a suspicion must last [s]")
-    hypotheses: int = Field(400, ge=1, description="shapes drawn from the shape prior when lost")
-    refined: int = Field(6, ge=1, description="how many of the best are refined")
+    suspect_share: float = Field(0.9, ge=0.0, le=1.0, description="share of fitting zones on the worst ring below "
+                                                                  "which the body is suspect")
+    patience: float = Field(0.3, ge=0.0, description="time that a suspicion must last before a search [s]")
+    max_curvature: float = Field(1.5, gt=0.0, description="greatest curvature that the search tries [1/m]")
+    curvature_step: float = Field(0.25, gt=0.0, description="step of the search's curvatures [1/m]")
+    beam: int = Field(24, ge=1, description="partial bodies that the search keeps at each ring")
+    distinct: float = Field(0.02, ge=0.0, description="least distance between two kept partial bodies [m]")
+    refined: int = Field(6, ge=1, description="how many of the best bodies are refined by the filter itself")
+    score_gate: float = Field(0.3, gt=0.0, description="farthest map point that a zone may match in the search [m]")
+    score_floor: float = Field(0.03, gt=0.0, description="noise that stands for the search's coarseness [m]")
+    margin: float = Field(0.1, ge=0.0, description="share by which another body's cost must be lower to be taken")
+    lost_sigma: tuple[float, float] = Field((0.1, 0.3), description="spread added to the tip's pose while lost, less "
+                                                                    "towards the base [m, rad]")
 
 
 class EstimatorSettings(Settings):

@@ -9,23 +9,26 @@ is marginalised as the window moves on.
 from __future__ import annotations
 
 import time as clock
-from collections import Counter, deque
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
-from continuum_loc import lie
-from continuum_loc.estimator.chain import Chain, SingularError
+from continuum_loc.estimator.chain import Chain, Message, SingularError
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.factors import FACTORS, Factor, MeasurementError, TofFactor
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.output import MOTION, Body, backbone, body_between, motion_covariance
 from continuum_loc.estimator.priors import Priors
+from continuum_loc.estimator.recovery import ShapeSearch, Snapshot, Watch, place
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import NODE_DIM, Column, Grid, column_at_rest
 from continuum_loc.measurements import ImuSample, Measurement, TofFrame, seconds
 from continuum_loc.robot import RobotDescription
 
 TIME_EPSILON = 1e-9  # stamps are integer nanoseconds
+DAMPING_LIMIT = 1e4
+AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 COST_SLACK = 1e-3  # relative: associations change between iterations, so costs compare only so well
 
 
@@ -46,6 +49,8 @@ class SlidingWindowFilter:
                                       if self._wanted(kind.name)]
         if self.tof is not None:
             self.factors.append(self.tof)
+            self._shapes = ShapeSearch(self.grid, self.tof, self.settings.recovery, self.priors.rest,
+                                       np.array(self.settings.prior.strain))
         self._backbone_s = np.linspace(0.0, robot.length, self.settings.backbone_points)
         self.counts = {"received": Counter(), "used": Counter(), "dropped": Counter()}
         self.reset()
@@ -64,6 +69,8 @@ class SlidingWindowFilter:
         self._last_cycle: set[str] = set()
         self._cycle_start: int | None = None
         self._rest: dict[str, list[np.ndarray]] | None = {}
+        self._rest_bias: tuple[np.ndarray, np.ndarray] | None = None
+        self.watch = Watch(self.settings.recovery)
 
     # ------------------------------------------------------------------ measurements in, estimates out
 
@@ -140,12 +147,25 @@ class SlidingWindowFilter:
     def _start(self, stamp: int) -> None:
         self.epoch = self.newest = stamp
         strain = np.tile(self.priors.rest, (self.grid.nodes, 1))
-        self._restart(column_at_rest(self.grid, self.priors.T_map_base, strain, 0.0))
+        self.columns = [column_at_rest(self.grid, self.priors.T_map_base, strain, 0.0)]
+        self.offsets = [np.zeros(self.grid.dim)]
+        self._restart_chain(moving=False)
 
-    def _restart(self, column: Column) -> None:
-        self.columns, self.offsets, self.intervals = [column], [np.zeros(self.grid.dim)], []
-        self.chain = Chain(self.grid.dim, self.priors.start(column))
-        self._marginalised = False
+    def _restart_chain(self, moving: bool) -> None:
+        """Forget the past of the oldest column."""
+        self._moving, self._marginalised = moving, False
+        self.chain = Chain(self.grid.dim, self._start_message())
+        for interval in self.intervals:
+            interval.changed = True
+
+    def _start_message(self) -> Message:
+        message = self.priors.start(self.columns[0], self._moving)
+        if self._rest_bias is not None:
+            weight, mean = self._rest_bias
+            at = np.arange(self.grid.bias_offset, self.grid.dim)
+            message.information[at, at] += weight
+            message.gradient[at] += weight * (self.columns[0].bias.ravel() - mean)
+        return message
 
     def _interval_at(self, time: float) -> Interval:
         """The interval (t_k, t_k+1] that holds `time`, with new knots appended as needed."""
@@ -183,37 +203,54 @@ class SlidingWindowFilter:
             self._guess_shape()
         iterations, converged = self._optimise()
         self._finish_rest()
-        self.acquired = self.acquired or converged
+        if self.tof is not None and self.settings.recovery.enabled:
+            self._look_after(converged)
+        else:
+            self.acquired = self.acquired or converged
         return self._estimate(iterations, converged, clock.perf_counter() - started)
 
     def _optimise(self) -> tuple[int, bool]:
-        """Gauss-Newton with damping when a step raises the cost: (iterations, whether it converged)."""
+        """Gauss-Newton with damping when a step fails: (iterations, whether it converged).
+
+        Costs are compared only while acquiring: when tracking, a step starts next to the minimum.
+        """
         solver = self.settings.solver
         limit = solver.max_iterations if self.acquired else solver.acquisition_iterations
-        damping, first = 0.0, self._linearise()
+        damping, first = 0.0, len(self.intervals)
         for iteration in range(1, limit + 1):
+            self._set_gate(iteration)
+            first = min(first, self._linearise())
             before = None if self.acquired else (self.columns.copy(), self.offsets.copy(), self._cost())
             try:
                 offsets = self.chain.solve([interval.blocks for interval in self.intervals], first, damping)
             except SingularError:
                 damping, first = max(10.0 * damping, 1e-4), 0
-                if damping > 1e3:
+                if damping > DAMPING_LIMIT:
                     raise
                 continue
             move = self._largest_move(offsets)
-            first = self._move(offsets)
-            self._set_gate(iteration)
-            first = min(first, self._linearise())
+            first = min(self._move(offsets), self._linearise())
             if before is not None and self._cost() > before[2] * (1.0 + COST_SLACK) + 1.0:
-                self.columns, self.offsets = before[:2]
-                for interval in self.intervals:
-                    interval.changed = True
-                first, damping = self._linearise(), max(10.0 * damping, 1e-3)
+                self._undo(*before[:2])
+                first, damping = 0, max(10.0 * damping, 1e-3)
+                if damping > DAMPING_LIMIT:
+                    break
                 continue
-            damping = damping / 10.0 if damping > 1e-6 else 0.0
             if move < solver.tolerance and self._gate_closed():
                 return iteration, True
+            first, damping = (0, 0.1 * damping if damping > 1e-3 else 0.0) if damping > 0.0 else (first, 0.0)
+        if damping > 0.0:  # the covariance must not know of the damping
+            self.chain.solve([interval.blocks for interval in self.intervals], 0)
         return limit, False
+
+    def _undo(self, columns: list[Column], offsets: list[np.ndarray]) -> None:
+        """Back to where a failed step started."""
+        moved = [old is not new for old, new in zip(columns, self.columns, strict=True)]
+        self.columns, self.offsets = columns, offsets
+        for k, interval in enumerate(self.intervals):
+            interval.changed = interval.changed or moved[k] or moved[k + 1]
+        if moved[0]:
+            self.chain.messages[0] = self._start_message()
 
     def _linearise(self) -> int:
         """Linearise the intervals that changed; the first of them."""
@@ -242,7 +279,7 @@ class SlidingWindowFilter:
             self.columns[k] = self.columns[k].retract(offset)
             self.offsets[k] = np.zeros(self.grid.dim)
             if k == 0:
-                self.chain.messages[0] = self.priors.start(self.columns[0])
+                self.chain.messages[0] = self._start_message()
             for touched in (k - 1, k):
                 if 0 <= touched < len(self.intervals):
                     self.intervals[touched].changed = True
@@ -271,18 +308,14 @@ class SlidingWindowFilter:
                     strain[:, 4 + i] = np.interp(self.grid.s, s[order], bending[order, i])
             if factor.name == "insertion" and rows:
                 T_base = rows[0][1]
-        if len(self.columns) <= 3 and not self._marginalised:
-            self._place(column_at_rest(self.grid, T_base, strain, column.time))
+        if len(self.columns) == 2 and not self._marginalised:
+            self._place(place(self.grid, column, T_base, strain), moving=True)
 
-    def _place(self, column: Column) -> None:
-        """Put the whole window at one motionless column."""
-        for k, old in enumerate(self.columns):
-            self.columns[k] = Column(old.time, column.T.copy(), column.strain.copy(), column.velocity.copy(),
-                                     old.bias.copy())
-            self.offsets[k] = np.zeros(self.grid.dim)
-        self.chain = Chain(self.grid.dim, self.priors.start(self.columns[0]))
-        for interval in self.intervals:
-            interval.changed = True
+    def _place(self, shape: Column, moving: bool) -> None:
+        """Put the whole window motionless into one shape and forget what came before it."""
+        self.columns = [replace(shape, time=old.time) for old in self.columns]
+        self.offsets = [np.zeros(self.grid.dim) for _ in self.columns]
+        self._restart_chain(moving)
 
     def _set_gate(self, iteration: int) -> None:
         """Wide at first, when the shape is a guess, then narrowing to the tracking gate."""
@@ -310,17 +343,88 @@ class SlidingWindowFilter:
         rest, self._rest = self._rest, None
         if options.rest_time == 0.0 or self._marginalised:
             return
-        start = self.chain.messages[0]
+        weight, mean = np.zeros(3 * self.grid.biases), np.zeros(3 * self.grid.biases)
         for number, imu in enumerate(self.robot.imu):
             rates = np.array(rest.get(imu.name, []))
             if len(rates) < 10 or np.max(np.std(rates, axis=0)) > options.rest_rate:
                 continue
-            at = self.grid.bias_offset + 3 * number + np.arange(3)
-            weight = len(rates) / self.robot.imu_model.gyro_sigma**2
-            mean = imu.mount.T_ring_sensor[:3, :3] @ np.mean(rates, axis=0)
-            start.information[at, at] += weight
-            start.gradient[at] += weight * (self.columns[0].bias[number] - mean)
-            self.intervals[0].changed = True
+            weight[3 * number:3 * number + 3] = len(rates) / self.robot.imu_model.gyro_sigma**2
+            mean[3 * number:3 * number + 3] = imu.mount.T_ring_sensor[:3, :3] @ np.mean(rates, axis=0)
+        self._rest_bias = weight, mean
+        self.chain.messages[0] = self._start_message()
+        self.intervals[0].changed = True
+
+    # ------------------------------------------------------------------ lost and found
+
+    def _look_after(self, converged: bool) -> None:
+        """Notice a wrong minimum by the worst ring's share of fitting zones, and look for a better body."""
+        time = seconds(self.newest, self.epoch)
+        fitting = self._worst_share() >= self.settings.recovery.suspect_share
+        self.acquired = self.acquired or (converged and fitting)
+        due = self.watch.update(time, self._worst_share())
+        if due or (not fitting and not self.acquired and time >= self.watch.next_search):
+            self.watch.searched(time, confirmed=self._search())
+
+    def _worst_share(self) -> float:
+        """Least share of fitting zones over the rings, in the newest interval that has ToF frames."""
+        fits = self._newest_fits()
+        by_ring: dict[str, np.ndarray] = {}
+        for sensor in self.robot.tof:
+            if sensor.name in fits:
+                by_ring[sensor.ring] = by_ring.get(sensor.ring, 0.0) + fits[sensor.name]
+        return min((fit[1] / fit[0] for fit in by_ring.values() if fit[0] > 0), default=1.0)
+
+    def _newest_fits(self) -> dict[str, np.ndarray]:
+        for interval in reversed(self.intervals):
+            if "tof" in interval.reports:
+                return interval.reports["tof"].fits
+        return {}
+
+    def _search(self) -> bool:
+        """Try the shapes that a search finds; True when the body that results is to be believed."""
+        rows = [row for interval in self.intervals[-2:] for row in interval.rows(self.tof)]
+        if not rows:
+            return False
+        self._keep_newest_intervals(2)
+        current = self._snapshot_state()
+        best, best_cost, rivals = current, self._fit_cost(), []
+        T_base = current[0][-1].T[0]
+        for strain in self._shapes.find(T_base, Snapshot.of(rows)):
+            self._place(place(self.grid, current[0][-1], T_base, strain), moving=True)
+            self.acquired = False
+            self._optimise()
+            cost, state = self._fit_cost(), self._snapshot_state()
+            rivals.append((cost, state[0][-1].T[self.grid.ring_nodes, :3, 3]))
+            if cost < best_cost * (1.0 - self.settings.recovery.margin):
+                best, best_cost = state, cost
+        self._restore(best)
+        self.acquired = True
+        chosen = best[0][-1].T[self.grid.ring_nodes, :3, 3]
+        limit = best_cost * (1.0 + self.settings.recovery.margin)
+        return all(np.max(np.linalg.norm(place_ - chosen, axis=1)) < AMBIGUOUS or cost > limit
+                   for cost, place_ in rivals)
+
+    def _keep_newest_intervals(self, count: int) -> None:
+        """Shorten the window: what led a lost body astray is forgotten."""
+        drop = max(len(self.intervals) - count, 0)
+        del self.columns[:drop], self.offsets[:drop], self.intervals[:drop]
+        self.columns = [column.retract(offset) for column, offset in zip(self.columns, self.offsets, strict=True)]
+        self.offsets = [np.zeros(self.grid.dim) for _ in self.columns]
+        self._restart_chain(moving=True)
+        self._optimise()
+
+    def _fit_cost(self) -> float:
+        return sum(report.cost for interval in self.intervals for report in interval.reports.values())
+
+    def _snapshot_state(self) -> tuple[list[Column], list[np.ndarray]]:
+        return [c.retract(x) for c, x in zip(self.columns, self.offsets, strict=True)], [np.zeros(self.grid.dim)
+                                                                                         for _ in self.columns]
+
+    def _restore(self, state: tuple[list[Column], list[np.ndarray]]) -> None:
+        self.columns, self.offsets = list(state[0]), list(state[1])
+        self._restart_chain(moving=True)
+        self.acquired = True
+        self._optimise()
 
     # ------------------------------------------------------------------ the output
 
@@ -342,8 +446,13 @@ class SlidingWindowFilter:
             strain=body.strain[rings], velocity=body.velocity[rings], velocity_covariance=covariance[:, 6:, 6:],
             backbone_s=self._backbone_s,
             T_map_backbone=backbone(self.grid, body.T, body.strain, self._backbone_s),
-            status="tracking" if self.acquired else "initialising", consistency=squared / max(count, 1),
+            status=self._status(), consistency=squared / max(count, 1),
             inliers=inliers, iterations=iterations, converged=converged, step_seconds=elapsed, lagged=lagged)
+
+    def _status(self) -> str:
+        if self.watch.lost:
+            return "lost"
+        return "tracking" if self.acquired else "initialising"
 
     def _body(self, time: float) -> tuple[Body, np.ndarray]:
         """The nodes at `time` in the window, and the covariance (R + 1, 12, 12) of each ring's [pose, velocity]."""
@@ -353,7 +462,12 @@ class SlidingWindowFilter:
         rings = self.grid.ring_nodes
         rows = (NODE_DIM * rings[:, None] + MOTION).ravel()
         P = self.chain.joint_covariance(k, rows)
-        return body_between(a, b, time), motion_covariance(a, b, time, rings, P, np.array(self.settings.prior.velocity))
+        covariance = motion_covariance(a, b, time, rings, P, np.array(self.settings.prior.velocity))
+        if self.watch.lost:
+            reach = (self.grid.s[rings] / self.grid.s[-1])[:, None]
+            sigma = np.repeat(self.settings.recovery.lost_sigma, 3)
+            covariance[:, np.arange(6), np.arange(6)] += np.square(reach * sigma)
+        return body_between(a, b, time), covariance
 
     def _fit(self) -> tuple[float, int, dict[str, float]]:
         """Squared normalised residuals and their number over the window, and the share of fitting zones by sensor."""

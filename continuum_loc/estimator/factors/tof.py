@@ -42,6 +42,11 @@ class TofFactor(Factor):
         model = robot.tof_model
         self._half_zone = np.tan(np.radians(model.fov_deg) / 2.0) / max(model.rows, model.columns)
 
+    @property
+    def map_arrays(self) -> tuple:
+        """What the kernels need of the map: lookup, points, normals, weights, variance."""
+        return self._index.arrays, self._cloud, self._normals, self._planarity, self._map_variance
+
     def row(self, measurement: TofFrame) -> tuple:
         number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, "ToF")
         if self._index is None:
@@ -72,7 +77,7 @@ class TofFactor(Factor):
         fits = np.zeros((len(times), 2))
         cost, squared, count = _add(
             blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, b.time - a.time, times, nodes, q, rays, variance,
-            weights, self._index.arrays, self._cloud, self._normals, self._planarity, self._map_variance, options.floor**2,
+            weights, *self.map_arrays, options.floor**2,
             options.footprint * self._half_zone, options.cauchy, self.gate, options.min_cosine, fits)
         by_sensor = np.zeros((len(self._names), 2))
         np.add.at(by_sensor, sensors, fits)

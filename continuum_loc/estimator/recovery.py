@@ -1,0 +1,145 @@
+"""Lost and found: noticing that the body is in a wrong minimum, and finding it from the base and the map alone.
+
+A wrong minimum shows in the share of ToF zones that fit the map. A low share alone is no proof (the scene may differ
+from the map), so a suspicion leads to a search of all shapes: where nothing fits better, the filter was right.
+
+The search goes along the body, ring by ring, as a beam search: each segment bends with a curvature from a grid round
+zero, a partial body is scored by the zones of the rings it has reached, and the best, mutually different ones go on.
+It needs no initial guess and no randomness, so a replay finds the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from continuum_loc import lie
+from continuum_loc.estimator.factors.tof import TofFactor, frame_information
+from continuum_loc.estimator.settings import RecoverySettings
+from continuum_loc.estimator.state import Column, Grid, shape_from_strain
+
+ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
+BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
+
+
+@dataclass(slots=True)
+class Watch:
+    """Whether the body is to be believed: suspicion, and when to search next (times in seconds of data)."""
+
+    settings: RecoverySettings
+    since: float | None = None
+    next_search: float = 0.0
+    backoff: float = 1.0
+    lost: bool = False
+
+    def update(self, time: float, worst_share: float) -> bool:
+        """Note the least share of fitting zones over the rings; True when a search is due."""
+        if worst_share >= self.settings.suspect_share:
+            self.since, self.backoff, self.lost, self.next_search = None, 1.0, False, time
+            return False
+        self.since = time if self.since is None else self.since
+        return time - self.since >= self.settings.patience and time >= self.next_search
+
+    def searched(self, time: float, confirmed: bool) -> None:
+        """Note a search's outcome: a body that nothing beats is believed, whatever its share."""
+        self.lost = not confirmed
+        self.backoff = min(2.0 * self.backoff, BACKOFF_LIMIT)
+        self.next_search = time + self.backoff
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """The newest frame of each ToF sensor: node (F,), zones q and rays (F, Z, 3) in the node's frame, variance (F, Z)."""
+
+    nodes: np.ndarray
+    q: np.ndarray
+    rays: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def of(cls, rows: list[tuple]) -> Snapshot:
+        """From a ToF factor's rows, in order of arrival."""
+        newest = {row[0]: row for row in rows}
+        _, nodes, q, rays, variance = zip(*(newest[sensor] for sensor in sorted(newest)), strict=True)
+        return cls(np.array(nodes), *(np.ascontiguousarray(np.array(x)[:, ::ZONE_STRIDE]) for x in (q, rays, variance)))
+
+
+class ShapeSearch:
+    """Beam search over bent shapes for the ones that a snapshot fits."""
+
+    def __init__(self, grid: Grid, tof: TofFactor, settings: RecoverySettings, rest_strain: np.ndarray,
+                 strain_psd: np.ndarray):
+        self.grid, self.tof, self.settings, self.rest = grid, tof, settings, rest_strain
+        count = int(round(settings.max_curvature / settings.curvature_step))
+        steps = settings.curvature_step * np.arange(-count, count + 1)
+        self.curvatures = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
+        self.curvatures = self.curvatures[np.hypot(*self.curvatures.T) <= settings.max_curvature + 1e-9]
+        self._bending_psd = float(np.mean(strain_psd[4:]))
+
+    def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
+        """Strain (N, 6) at the nodes of the best shapes, best first."""
+        rings = self.grid.ring_nodes
+        T, cost = T_map_base[None], np.zeros(1)
+        bends = np.zeros((1, 0, 2))
+        for ring in range(1, len(rings)):
+            length = self.grid.s[rings[ring]] - self.grid.s[rings[ring - 1]]
+            T, cost, bends = self._extend(T, cost, bends, length, rings[ring], snapshot)
+        return [self._strain_at_nodes(bend) for bend in bends[:self.settings.refined]]
+
+    def _extend(self, T, cost, bends, length, node, snapshot):
+        parents, grid = len(T), len(self.curvatures)
+        strain = np.tile(self.rest, (grid, 1))
+        strain[:, 4:] += self.curvatures
+        ends = (T[:, None] @ lie.exp(length * strain)[None]).reshape(-1, 4, 4)
+        frames = np.flatnonzero(snapshot.nodes == node)
+        scores = self._score(ends, snapshot, frames) if len(frames) else np.zeros(len(ends))
+        before = bends[:, -1] if bends.shape[1] else np.zeros((parents, 2))
+        change = np.sum((self.curvatures[None] - before[:, None]) ** 2, axis=2) / (self._bending_psd * length)
+        total = (cost[:, None] + 0.5 * change).ravel() + scores
+        chosen = self._different(total, ends)
+        grown = np.concatenate([bends[chosen // grid], self.curvatures[chosen % grid][:, None]], axis=1)
+        return ends[chosen], total[chosen], grown
+
+    def _score(self, T: np.ndarray, snapshot: Snapshot, frames: np.ndarray) -> np.ndarray:
+        tof, options = self.tof, self.tof.settings.tof
+        return _score(T, snapshot.q[frames], snapshot.rays[frames], snapshot.variance[frames], *tof.map_arrays,
+                      self.settings.score_floor**2, options.cauchy, self.settings.score_gate, options.min_cosine)
+
+    def _different(self, total: np.ndarray, T: np.ndarray) -> np.ndarray:
+        """The best `beam` candidates no two of which lie within `distinct` of one another."""
+        chosen: list[int] = []
+        for candidate in np.argsort(total, kind="stable"):
+            gaps = [np.linalg.norm(T[candidate, :3, 3] - T[c, :3, 3]) for c in chosen]
+            if not gaps or min(gaps) >= self.settings.distinct:
+                chosen.append(int(candidate))
+            if len(chosen) == self.settings.beam:
+                break
+        return np.array(chosen)
+
+    def _strain_at_nodes(self, bends: np.ndarray) -> np.ndarray:
+        """Strain (N, 6) whose curvature runs through the segments' curvatures at their middles."""
+        s = self.grid.s[self.grid.ring_nodes]
+        strain = np.tile(self.rest, (self.grid.nodes, 1))
+        for i in range(2):
+            strain[:, 4 + i] += np.interp(self.grid.s, 0.5 * (s[1:] + s[:-1]), bends[:, i])
+        return strain
+
+
+def place(grid: Grid, column: Column, T_map_base: np.ndarray, strain: np.ndarray) -> Column:
+    """The column put motionless into another shape; its biases stay."""
+    return Column(column.time, shape_from_strain(T_map_base, grid.s, strain), strain.copy(), np.zeros_like(strain),
+                  column.bias.copy())
+
+
+@njit(cache=True)
+def _score(T, q, rays, variance, arrays, cloud, normals, planarity, map_variance, floor2, cauchy, gate, min_cosine):
+    H, g, fit = np.empty((6, 6)), np.empty(6), np.zeros(2)
+    out = np.zeros(T.shape[0])
+    for m in range(T.shape[0]):
+        for f in range(q.shape[0]):
+            cost, _, _ = frame_information(T[m], q[f], rays[f], variance[f], 1.0, arrays, cloud, normals, planarity,
+                                           map_variance, floor2, 0.0, cauchy, gate, min_cosine, H, g, fit)
+            out[m] += cost
+    return out
