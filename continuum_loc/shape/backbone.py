@@ -1,6 +1,6 @@
 """All modules at once: one smooth, inextensible backbone that explains every field and every attitude.
 
-The backbone is a chain of arcs of constant twist and curvature, one from each module to the next, so that
+The backbone is a chain of arcs of constant twist and curvature, `PIECES` from each module to the next, so that
 arclengths hold exactly and neighbours share what they know. Against solving eq. 10 module by module, a module
 whose field says little (far away, on the equatorial plane, saturated) is held by the others.
 
@@ -21,12 +21,13 @@ from continuum_loc.robot import RobotDescription
 from continuum_loc.shape.magnet import FieldModel, evaluate_field, magnet_parameters
 
 MAX_ITERATIONS = 50
+PIECES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BackboneFit:
-    """T_base_module (M, 4, 4); covariance (M, 6, 6) of a right perturbation [rho; phi]; strain (M, 3): twist and
-    the two curvatures of the arc before each module [1/m]; cost: half the sum of squares; dimension: of the
+    """T_base_module (M, 4, 4); covariance (M, 6, 6) of a right perturbation [rho; phi]; strain (N, 3): twist and
+    the two curvatures of the N = PIECES * M arcs [1/m]; cost: half the sum of squares; dimension: of the
     measurements in it; converged."""
 
     T_base_module: np.ndarray
@@ -47,24 +48,26 @@ class BackboneSolver:
 
     def __init__(self, robot: RobotDescription, arclengths: np.ndarray, model: FieldModel = "ring",
                  step_sigma: float = 15.0) -> None:
-        arclengths = np.asarray(arclengths, float)
-        self.lengths = np.diff(arclengths, prepend=0.0)
+        """step_sigma: how much the curvature changes from one module to the next, 1 sigma [1/m]."""
+        gaps = np.diff(np.asarray(arclengths, float), prepend=0.0)
+        self.lengths = np.repeat(gaps / PIECES, PIECES)
         self.parameters = magnet_parameters(robot.magnet, model)
         self.magnet_s = robot.magnet.s
         self.rest = np.array(robot.backbone.rest_strain[3:])
         sigma = np.array(robot.backbone.rest_strain_sigma[3:])
-        # The prior on the strain of each arc and on the curvature's step from one arc to the next.
-        count = len(arclengths)
+        # The prior on the strain (its mean from module to module) and on the curvature's walk from arc to arc.
+        count = len(self.lengths)
         step = np.diff(np.eye(count), axis=0)
-        weights = [np.kron(np.eye(count), np.diag(sigma**-2.0)),
-                   np.kron(step.T @ step, np.diag([0.0, step_sigma**-2.0, step_sigma**-2.0]))]
+        walk = PIECES / step_sigma**2
+        weights = [np.kron(np.eye(count), np.diag(sigma**-2.0)) / PIECES,
+                   np.kron(step.T @ step, np.diag([0.0, walk, walk]))]
         self.prior = np.ascontiguousarray(sum(weights))
 
     def solve(self, field: np.ndarray, field_sigma: np.ndarray, earth: np.ndarray, R_base_module: np.ndarray,
               information: np.ndarray, start: np.ndarray | None = None) -> BackboneFit:
         """Fit to field (M, 3) [T] in the modules' frames with sigma (M, 3) (inf drops a component), the Earth's
         field (3,) [T] in the base frame, and attitudes R_base_module (M, 3, 3) with information (M, 3, 3)
-        [1/rad^2] in the modules' frames (zeros drop one). start: strain (M, 3) of an earlier fit."""
+        [1/rad^2] in the modules' frames (zeros drop one). start: strain (N, 3) of an earlier fit."""
         strain = np.tile(self.rest, (len(self.lengths), 1)) if start is None else np.array(start, dtype=float)
         weight = 1.0 / np.asarray(field_sigma, float) ** 2
         measured = np.where(weight > 0.0, field, 0.0)
@@ -80,7 +83,7 @@ class BackboneSolver:
 
 @njit(cache=True)
 def _solve(strain, lengths, parameters, magnet_s, rest, prior, field, weight, earth, R_measured, information):
-    """Levenberg-Marquardt on `strain` (M, 3), in place."""
+    """Levenberg-Marquardt on `strain` (N, 3), in place."""
     count = 3 * lengths.size
     T, chain = _forward(strain, lengths)
     H, slope, cost = _normal(T, chain, strain, parameters, magnet_s, rest, prior, field, weight, earth, R_measured,
@@ -110,31 +113,29 @@ def _solve(strain, lengths, parameters, magnet_s, rest, prior, field, weight, ea
 
 @njit(cache=True)
 def _forward(strain, lengths):
-    """T_base_module (M, 4, 4), and its right-perturbation Jacobian by all strains, chain (M, 6, 3 M)."""
-    modules = lengths.size
-    T = np.zeros((modules, 4, 4))
-    chain = np.zeros((modules, 6, 3 * modules))
+    """T_base_module (M, 4, 4), and its right-perturbation Jacobian by all strains, chain (M, 6, 3 N)."""
+    arcs = lengths.size
+    T = np.zeros((arcs, 4, 4))
+    chain = np.zeros((arcs, 6, 3 * arcs))
     xi, c, dc = np.zeros(6), np.empty(5), np.empty(5)
     arc, back = np.empty((4, 4)), np.empty((4, 4))
     A, J, work, carry = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    for m in range(modules):
-        xi[0] = lengths[m]
+    identity = np.eye(4)
+    for n in range(arcs):
+        xi[0] = lengths[n]
         for i in range(3):
-            xi[3 + i] = lengths[m] * strain[m, i]
+            xi[3 + i] = lengths[n] * strain[n, i]
         lie_kernels.exp(xi, arc)
-        if m == 0:
-            T[m] = arc
-        else:
-            lie_kernels.compose(T[m - 1], arc, T[m])
-        lie_kernels.relative(arc, np.eye(4), back)
-        lie_kernels.adjoint(back, carry)  # Ad(arc^-1) brings the previous module's perturbation here
-        if m > 0:
-            chain[m] = carry @ chain[m - 1]
+        lie_kernels.compose(T[n - 1] if n > 0 else identity, arc, T[n])
+        lie_kernels.relative(arc, identity, back)
+        lie_kernels.adjoint(back, carry)  # Ad(arc^-1) brings the previous arc's perturbation here
+        if n > 0:
+            chain[n] = carry @ chain[n - 1]
         lie_kernels.ad(xi, A)
         lie_kernels.right_coefficients(xi, c, dc)
         lie_kernels.polynomial(c, A, J, work)
-        chain[m, :, 3 * m:3 * m + 3] = lengths[m] * J[:, 3:]
-    return T, chain
+        chain[n, :, 3 * n:3 * n + 3] = lengths[n] * J[:, 3:]
+    return T[PIECES - 1::PIECES].copy(), chain[PIECES - 1::PIECES].copy()
 
 
 @njit(cache=True)

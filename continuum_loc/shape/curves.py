@@ -246,6 +246,12 @@ def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
+def _cross3(a, b):
+    """a x b; NumPy's own takes seconds to compile."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True)
 def extended(points: np.ndarray, length: float) -> np.ndarray:
     """The curve carried on to `length` [m] with the curvature of its last tenth, or as it is when that long already."""
     s = arclength(points)
@@ -255,15 +261,15 @@ def extended(points: np.ndarray, length: float) -> np.ndarray:
     back = max(2, len(points) // 10)
     a, b, c = points[-1 - 2 * (back // 2)], points[-1 - back // 2], points[-1]
     first, second = b - a, c - b
-    bend = np.cross(first, second)
+    bend = _cross3(first, second)
     size = np.sqrt((bend**2).sum())
     chord = np.sqrt((second**2).sum())
     # Two chords of one circle: they turn by the arc between their middles; the tangent is half a chord further on.
     turn = np.arctan2(size, (first * second).sum())
-    curvature = turn / chord
+    curvature = 2.0 * np.sin(turn / 2) / chord
     tangent, normal = second / chord, np.zeros(3)
     if size > 1e-30:
-        normal = np.cross(bend / size, tangent)
+        normal = _cross3(bend / size, tangent)
         tangent, normal = (np.cos(turn / 2) * tangent + np.sin(turn / 2) * normal,
                            np.cos(turn / 2) * normal - np.sin(turn / 2) * tangent)
     count = max(2, int(np.ceil(len(points) * missing / s[-1])))
