@@ -104,11 +104,11 @@ def test_a_released_rod_only_loses_energy():
     assert np.diff(energy).max() < 1e-3 * lost
 
 
-def tendon_rod(EA=None, relaxation=0.05, max_force=200.0):
+def tendon_rod(EA=None, relaxation=0.05, max_force=200.0, friction=0.0):
     robot = RobotDescription(name="rod", length=LENGTH, radius=0.03, rings=(Ring(name="end", s=LENGTH),))
     plant = PlantSettings(EI=EI, GJ=EI, EA=EA, mass_per_metre=MASS, relaxation=relaxation,
                           tendons=({"end": LENGTH, "azimuth_deg": (0, 90, 180, 270), "radius": 0.02,
-                                    "max_force": max_force},),
+                                    "max_force": max_force, "friction": friction},),
                           profiles={"live": {"link_length": LENGTH / 40, "time_step": 0.005}})
     return plant, build_model(robot, plant, supported=True)
 
@@ -136,6 +136,24 @@ def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
     mujoco.mj_forward(model, data)
     assert LENGTH - data.body("node40").xpos[0] == pytest.approx(8.0 * LENGTH / stiffness, rel=1e-3)
     np.testing.assert_allclose(data.ten_length, LENGTH * (1.0 - 8.0 / stiffness), rtol=1e-3)
+
+
+def test_tendon_friction_leaves_a_hysteresis():
+    """From below and from above, the same tension F bends as F - 2 f and F + 2 f: two tendons move, both rub."""
+    friction, pull = 0.5, 3.0
+    plant, model = tendon_rod(friction=friction)
+    data = mujoco.MjData(model)
+    bends = []
+    for tension in (pull, 2.0 * pull, pull):
+        data.ctrl[:] = [tension, 0.0, 0.0, 0.0]
+        data.time = 0.0
+        settle(model, data, rest_speed=1e-3)
+        mujoco.mj_forward(model, data)
+        R = data.body("node40").xmat.reshape(3, 3)
+        bends.append(np.arctan2(R[1, 0], R[0, 0]))
+    up, _, down = bends
+    per_newton = plant.tendons[0].radius * LENGTH / EI
+    assert (down - up) / per_newton == pytest.approx(4.0 * friction, rel=0.1)
 
 
 @given(arrays(float, (3, 2), elements=st.floats(-2.0, 2.0)), st.floats(0.0, 20.0))

@@ -27,6 +27,7 @@ REST_SPEED = 1e-4
 SETTLE_LIMIT = 60.0  # s of simulated time
 SETTLE_DAMPING = 8.0  # damping while settling, relative to the plant's: near critical for the first mode
 QUIET_STEPS = 20
+STICTION = (0.999, 0.999, 0.001, 0.5, 2.0)  # near-hard: MuJoCo's default friction creeps, and forgets a hysteresis
 DIVERGED_SPEED = 1e3  # rad/s or m/s
 GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
 
@@ -197,7 +198,7 @@ def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
         for azimuth in np.radians(group.azimuth_deg):
             name = next(names)
             offset = (group.radius * np.cos(azimuth), group.radius * np.sin(azimuth))
-            tendon = spec.add_tendon(name=name, frictionloss=group.friction)
+            tendon = spec.add_tendon(name=name, frictionloss=group.friction, solimp_friction=STICTION)
             for k, (i, x) in enumerate([(0, 0.0), *openings[:2 * last], (last, 0.0)]):
                 site = f"{name}_site{k}"
                 spec.body(f"{NODE_PREFIX}{i}").add_site(name=site, pos=(x, *offset), group=4)
