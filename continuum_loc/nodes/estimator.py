@@ -138,7 +138,7 @@ class EstimatorNode(WorkerNode):
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._initial_pose, 10)
 
     def _reset(self) -> str:
-        self.in_worker(partial(self._rebuild, self.robot))
+        self.in_worker(lambda: self._rebuild(self.robot))
         return "the estimate starts anew with the next sample"
 
     def _save_map(self) -> str:
@@ -179,7 +179,7 @@ class EstimatorNode(WorkerNode):
         mine = {name: value for name, value in values.items() if name.startswith(FILTER)}
         if mine:
             self.filter_settings = parameters.read(self, type(self.filter_settings), FILTER, changed=mine)
-            self.in_worker(partial(self._rebuild, self.robot))
+            self.in_worker(lambda: self._rebuild(self.robot))
         rest = {name: value for name, value in values.items() if name not in mine}
         return super()._change(rest) if rest else None
 
