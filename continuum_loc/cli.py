@@ -126,6 +126,72 @@ def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db
 
 
 @app.command()
+def shape(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db3 file")], robot: Robot = "hall_arm",
+          settings: Annotated[Path | None, typer.Option(help="shape settings (YAML); default: the package's")] = None,
+          out: Runs = Path("runs")) -> None:
+    """Estimate the shape from Hall sensors and IMUs of a recorded bag; the robot rests while it begins.
+
+    Example: `continuum-loc shape bench_top.mcap --robot my_arm.yaml`
+    """
+    from continuum_loc.evaluation.replay import replay as run_replay
+    from continuum_loc.evaluation.replay import samples_of
+    from continuum_loc.evaluation.runs import new_run, save_run
+    from continuum_loc.evaluation.shape_replay import ShapeReplay
+    from continuum_loc.robot import load_robot
+    from continuum_loc.shape import load_shape_settings
+
+    description = load_robot(robot)
+    estimator = ShapeReplay(description, load_shape_settings(settings))
+    result = run_replay(_progress(samples_of(bag), "estimating", _bag_duration(bag)), estimator)
+    folder = new_run("shape", out)
+    summary = save_run(folder, result, kind="shape", seed=None, configuration={
+        "robot": description, "bag": bag, "estimator": estimator.settings})
+    _write_report(folder)
+    console.print(_run_table(summary))
+    console.print(f"report  {folder}/report.html")
+
+
+@app.command()
+def tune(out: Annotated[Path, typer.Argument(help="settings file to write (YAML)")], robot: Robot = "engine",
+         bag: Annotated[Path | None, typer.Option(help="recorded hold-out with truth; default: the robot's own, "
+                                                  "simulated")] = None,
+         map_file: MapFile = None, settings: Settings = None,
+         jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1) -> None:
+    """Sweep process and measurement noise on a hold-out bag, by error and by consistency, and write what is best.
+
+    Example: `continuum-loc tune my_settings.yaml --bag hold_out --map my_map.npz --jobs 2`
+    """
+    import tempfile
+
+    from rich.progress import Progress
+
+    from continuum_loc.estimator.settings import load_estimator_settings
+    from continuum_loc.evaluation.split import hold_out
+    from continuum_loc.evaluation.trials import scene_map_file, simulate, write_bag
+    from continuum_loc.evaluation.tune import FACTORS, PARAMETERS
+    from continuum_loc.evaluation.tune import tune as sweep
+    from continuum_loc.robot import load_robot
+    from continuum_loc.settings import dump_settings
+
+    description = load_robot(robot)
+    start = load_estimator_settings(settings or description.name)
+    with tempfile.TemporaryDirectory() as scratch, Progress(console=errors, transient=True) as progress:
+        if bag is None:
+            bag = Path(scratch) / "hold_out"
+            progress.console.print(f"simulating the hold-out {hold_out(robot).recording}")
+            write_bag(bag, simulate(hold_out(robot)))
+        task = progress.add_task("sweeping", total=1 + len(PARAMETERS) * len(FACTORS))
+        best, tried = sweep(bag, description, map_file or scene_map_file(hold_out(robot).scene), start, jobs,
+                            tell=lambda one: progress.advance(task))
+    dump_settings(best, out)
+    best_tried = min(tried, key=lambda one: one.cost)
+    for name, one in (("start", tried[0]), ("best", best_tried)):
+        console.print(f"{name:6}{100 * one.translation_rmse_m:.3f} cm  {one.rotation_rmse_deg:.3f} deg  NEES/dof "
+                      f"{one.nees_per_dof:.2f}", highlight=False)
+    console.print(f"written {out}")
+
+
+@app.command()
 def report(run: Annotated[Path, typer.Argument(help="run folder")] = Path("runs/latest"),
            picture: Annotated[Path | None, typer.Option(help="also draw a still (PNG) and a moving picture (GIF): "
                                                         "their path without the ending")] = None) -> None:

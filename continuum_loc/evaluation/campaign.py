@@ -44,16 +44,16 @@ def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: Es
     progress = progress or _bar
     bags = {trial.recording: trial for trial in trials if not _bag(out, trial).is_dir()}
     failed = {}
-    for done in progress(_parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
+    for done in progress(parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
         failed |= done
     todo = [(out, trial, settings) for trial in trials if trial.recording not in failed]
     found = {}
-    for outcome in progress(_parallel(_estimate, todo, jobs), len(todo), "estimating"):
+    for outcome in progress(parallel(_estimate, todo, jobs), len(todo), "estimating"):
         found[outcome.trial] = outcome
     return [found.get(trial) or Outcome(trial, None, failed[trial.recording]) for trial in trials]
 
 
-def _parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]:
+def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]:
     """Results of `work(*arguments)` as they come. A worker that dies ends the campaign; what is done stays done."""
     if jobs == 1:
         yield from (work(*each) for each in arguments)

@@ -13,6 +13,14 @@ class SplitError(ValueError):
     """A trial on the wrong side of the split."""
 
 
+def hold_out(robot: str) -> Trial:
+    """The hold-out of a bundled robot. Raises SplitError for a robot that has none."""
+    if robot not in HOLD_OUT:
+        raise SplitError(f"robot '{robot}' has no hold-out of its own; give a bag and a map. Robots that have one: "
+                         f"{', '.join(HOLD_OUT)}")
+    return HOLD_OUT[robot]
+
+
 def is_hold_out(trial: Trial) -> bool:
     """Whether the trial's scene and trajectory are those of its robot's hold-out, whatever the seed."""
     held = HOLD_OUT.get(trial.robot)
