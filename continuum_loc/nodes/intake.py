@@ -104,8 +104,8 @@ class Inbox:
 class StampGate:
     """Rules for stamps. `judge` returns None to use a sample, or the class of error under which it is refused.
 
-    A leap beyond the tolerance is believed when `jump_confirmations` samples in a row agree on it: forward it
-    is a gap, backward the data starts again (`restarts` counts those), as a looped bag does.
+    A leap beyond the tolerance is believed when `jump_confirmations` samples agree on it and none came meanwhile that
+    does not leap: forward it is a gap, backward the data starts again (`restarts` counts those), as a looped bag does.
     """
 
     def __init__(self, settings: IntakeSettings) -> None:
@@ -116,7 +116,7 @@ class StampGate:
     def reset(self) -> None:
         """Forget the past: the next stamp starts anew."""
         self.newest: int | None = None
-        self._leap: list[int] = []
+        self._leaping: deque[int] = deque(maxlen=4 * self.settings.jump_confirmations)
         self._seen: dict[str, deque[int]] = {}
 
     def judge(self, stamp: int, sensor: str, now: int) -> str | None:
@@ -127,7 +127,7 @@ class StampGate:
             return "future stamp"
         if self._leaps(stamp) and not self._believed(stamp):
             return "leap"
-        self._leap.clear()
+        self._leaping.clear()
         seen = self._seen.setdefault(sensor, deque(maxlen=64))
         if stamp in seen:
             return "duplicate"
@@ -139,10 +139,10 @@ class StampGate:
         return self.newest is not None and abs(stamp - self.newest) > nanoseconds(self.settings.jump_tolerance)
 
     def _believed(self, stamp: int) -> bool:
-        if self._leap and abs(stamp - self._leap[-1]) > nanoseconds(self.settings.jump_tolerance):
-            self._leap.clear()
-        self._leap.append(stamp)
-        if len(self._leap) < self.settings.jump_confirmations:
+        tolerance = nanoseconds(self.settings.jump_tolerance)
+        self._leaping.append(stamp)
+        agreeing = sum(abs(other - stamp) <= tolerance for other in self._leaping)
+        if agreeing < self.settings.jump_confirmations:
             return False
         if stamp < self.newest:
             self.reset()

@@ -24,7 +24,7 @@ class Paced:
         self._items, self._lookahead, self._rate = items, lookahead, rate
         self._queue: Queue[Any] = Queue(maxsize=4000)
         self._stop = threading.Event()
-        self._progress = 0  # data stamp delivered last
+        self._progress: int | None = None  # data stamp delivered last, at first the first
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._prepare, name="lookahead", daemon=True)
 
@@ -39,7 +39,7 @@ class Paced:
         begin: float | None = None
         for stamp, item in self._prepared():
             if begin is None:
-                begin, first, self._progress = time.monotonic() + self._lookahead, stamp, stamp
+                begin, first = time.monotonic() + self._lookahead, stamp
                 on_start(stamp)
             due = begin + (stamp - first) / NANOSECONDS / self._rate
             if not self._wait_until(due):
@@ -81,7 +81,8 @@ class Paced:
 
     def _put(self, entry: Any, stamp: int) -> bool:
         ahead = self._lookahead * self._rate * NANOSECONDS
-        while self._progress and stamp - self._progress > ahead and not self._stop.is_set():
+        self._progress = stamp if self._progress is None else self._progress
+        while stamp - self._progress > ahead and not self._stop.is_set():
             time.sleep(0.002)
         while not self._stop.is_set():
             try:
