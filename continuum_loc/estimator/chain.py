@@ -31,7 +31,7 @@ class SingularError(ArithmeticError):
 
 @dataclass(slots=True, eq=False)
 class Blocks:
-    """Normal equations of one interval: H (2 D, 2 D) symmetric, g (2 D,), and the robust cost at the linearisation point."""
+    """Normal equations of one interval: H (2 D, 2 D) symmetric, g (2 D,), and the cost at the linearisation point."""
 
     H: np.ndarray
     g: np.ndarray

@@ -41,4 +41,4 @@ class Estimate:
     iterations: int = 0
     converged: bool = True
     step_seconds: float = 0.0
-    lagged: "Estimate | None" = None
+    lagged: Estimate | None = None

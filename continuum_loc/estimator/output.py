@@ -11,7 +11,6 @@ from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.state import Column, Grid
 
-
 MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
 

@@ -20,6 +20,7 @@ from continuum_loc.estimator.factors.tof import TofFactor, frame_information
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Column, Grid, shape_from_strain
 
+COARSE_SPACING = 0.04  # [m] of the thinned map that the search scores against; it has to tell decimetres apart
 ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
 BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
 
@@ -51,7 +52,9 @@ class Watch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """The newest frame of each ToF sensor: node (F,), zones q and rays (F, Z, 3) in the node's frame, variance (F, Z)."""
+    """The newest frame of each ToF sensor.
+
+    nodes (F,), zones q and rays (F, Z, 3) in the node's frame, variance (F, Z)."""
 
     nodes: np.ndarray
     q: np.ndarray
@@ -71,12 +74,21 @@ class ShapeSearch:
 
     def __init__(self, grid: Grid, tof: TofFactor, settings: RecoverySettings, rest_strain: np.ndarray,
                  strain_psd: np.ndarray):
-        self.grid, self.tof, self.settings, self.rest = grid, tof, settings, rest_strain
+        self.grid, self.settings, self.rest = grid, settings, rest_strain
+        self.options = tof.settings.tof
+        self._tof, self._thinned = tof, None
         count = int(round(settings.max_curvature / settings.curvature_step))
         steps = settings.curvature_step * np.arange(-count, count + 1)
         self.curvatures = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
         self.curvatures = self.curvatures[np.hypot(*self.curvatures.T) <= settings.max_curvature + 1e-9]
         self._bending_psd = float(np.mean(strain_psd[4:]))
+
+    @property
+    def _map(self) -> tuple:
+        """The thinned map, made at the first search."""
+        if self._thinned is None:
+            self._thinned = thinned(self._tof, COARSE_SPACING)
+        return self._thinned
 
     def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
         """Strain (N, 6) at the nodes of the best shapes, best first."""
@@ -103,9 +115,9 @@ class ShapeSearch:
         return ends[chosen], total[chosen], grown
 
     def _score(self, T: np.ndarray, snapshot: Snapshot, frames: np.ndarray) -> np.ndarray:
-        tof, options = self.tof, self.tof.settings.tof
-        return _score(T, snapshot.q[frames], snapshot.rays[frames], snapshot.variance[frames], *tof.map_arrays,
-                      self.settings.score_floor**2, options.cauchy, self.settings.score_gate, options.min_cosine)
+        return _score(T, snapshot.q[frames], snapshot.rays[frames], snapshot.variance[frames], *self._map,
+                      self.settings.score_floor**2, self.options.cauchy, self.settings.score_gate,
+                      self.options.min_cosine)
 
     def _different(self, total: np.ndarray, T: np.ndarray) -> np.ndarray:
         """The best `beam` candidates no two of which lie within `distinct` of one another."""
@@ -125,6 +137,21 @@ class ShapeSearch:
         for i in range(2):
             strain[:, 4 + i] += np.interp(self.grid.s, 0.5 * (s[1:] + s[:-1]), bends[:, i])
         return strain
+
+
+def thinned(tof: TofFactor, spacing: float) -> tuple:
+    """The map's arrays for the kernels with one point for each cell of `spacing` and each octant of the normal, so that
+    both sides of a thin blade stay."""
+    from continuum_loc.mapping.voxel_index import VoxelIndex
+
+    _, points, normals, planarity, variance = tof.map_arrays
+    cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+    octants = (normals > 0.0) @ np.array([1, 2, 4])
+    keys = np.ravel_multi_index((*cells.T, octants), (*(cells.max(axis=0) + 1), 8))
+    order = np.argsort(keys, kind="stable")
+    kept = order[np.flatnonzero(np.diff(keys[order], prepend=-1))]
+    index = VoxelIndex(points[kept], normals[kept])
+    return index.arrays, *(np.ascontiguousarray(x[kept]) for x in (points, normals, planarity)), variance
 
 
 def place(grid: Grid, column: Column, T_map_base: np.ndarray, strain: np.ndarray) -> Column:

@@ -51,7 +51,7 @@ class Grid:
 
 @dataclass(slots=True, eq=False)
 class Column:
-    """The body at one knot: time [s] since the filter's epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3)."""
+    """The body at one knot: time [s] since the epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3)."""
 
     time: float
     T: np.ndarray

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from continuum_loc import lie
 from continuum_loc.estimator.chain import Chain, Message, SingularError
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.factors import FACTORS, Factor, MeasurementError, TofFactor
@@ -28,6 +29,8 @@ from continuum_loc.robot import RobotDescription
 
 TIME_EPSILON = 1e-9  # stamps are integer nanoseconds
 DAMPING_LIMIT = 1e4
+REST_TURN = 0.005  # [rad] a body that turned farther during the initial rest was not at rest
+REST_SIGMA = 0.002  # [rad/s] how well rest is rest
 AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 COST_SLACK = 1e-3  # relative: associations change between iterations, so costs compare only so well
 
@@ -260,7 +263,8 @@ class SlidingWindowFilter:
         return changed[0] if changed else len(self.intervals)
 
     def _largest_move(self, offsets: list[np.ndarray]) -> float:
-        return max(float(np.max(np.abs(self._poses(new - old)))) for new, old in zip(offsets, self.offsets, strict=True))
+        changes = (new - old for new, old in zip(offsets, self.offsets, strict=True))
+        return max(float(np.max(np.abs(self._poses(change)))) for change in changes)
 
     def _poses(self, offset: np.ndarray) -> np.ndarray:
         return offset[:self.grid.bias_offset].reshape(-1, 18)[:, :6]
@@ -344,11 +348,14 @@ class SlidingWindowFilter:
         if options.rest_time == 0.0 or self._marginalised:
             return
         weight, mean = np.zeros(3 * self.grid.biases), np.zeros(3 * self.grid.biases)
+        turned = lie.so3_log(np.swapaxes(self.columns[0].T[:, :3, :3], 1, 2) @ self.columns[-1].T[:, :3, :3])
         for number, imu in enumerate(self.robot.imu):
             rates = np.array(rest.get(imu.name, []))
-            if len(rates) < 10 or np.max(np.std(rates, axis=0)) > options.rest_rate:
+            node = self.grid.node_at(self.robot.sensor_arclength(imu.name))
+            steady = len(rates) >= 10 and np.max(np.std(rates, axis=0)) <= options.rest_rate
+            if not steady or np.linalg.norm(turned[node]) > REST_TURN:
                 continue
-            weight[3 * number:3 * number + 3] = len(rates) / self.robot.imu_model.gyro_sigma**2
+            weight[3 * number:3 * number + 3] = 1.0 / (self.robot.imu_model.gyro_sigma**2 / len(rates) + REST_SIGMA**2)
             mean[3 * number:3 * number + 3] = imu.mount.T_ring_sensor[:3, :3] @ np.mean(rates, axis=0)
         self._rest_bias = weight, mean
         self.chain.messages[0] = self._start_message()

@@ -8,7 +8,7 @@ from numba import njit
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, known_sensor, require_finite
-from continuum_loc.estimator.state import NODE_DIM, VELOCITY
+from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.measurements import ImuSample
 
 

@@ -81,7 +81,8 @@ class TofFactor(Factor):
             options.footprint * self._half_zone, options.cauchy, self.gate, options.min_cosine, fits)
         by_sensor = np.zeros((len(self._names), 2))
         np.add.at(by_sensor, sensors, fits)
-        return FactorReport(cost, squared, count, {self._names[s]: by_sensor[s] for s in np.unique(sensors)})
+        heard = np.flatnonzero(np.bincount(sensors, minlength=len(self._names)))
+        return FactorReport(cost, squared, count, {self._names[s]: by_sensor[s] for s in heard})
 
 
 @njit(cache=True)
@@ -98,8 +99,8 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights,
         n = nodes[f]
         gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
         frame_cost, frame_squared, frame_count = frame_information(
-            T, q[f], rays[f], variance[f], weights[f], arrays, cloud, normals, planarity, map_variance, floor2, footprint,
-            cauchy, gate, min_cosine, H_body, g_body, fits[f])
+            T, q[f], rays[f], variance[f], weights[f], arrays, cloud, normals, planarity, map_variance, floor2,
+            footprint, cauchy, gate, min_cosine, H_body, g_body, fits[f])
         gp.time_index(n, VELOCITY, size, index)
         gp.add_local(H, g, index, H_body, g_body, J_pose, work)
         cost += frame_cost
