@@ -37,7 +37,7 @@ def generate_launch_description():
     replayer = Node(executable="replayer", name="replayer", condition=with_bag,
                     parameters=[{"bag": text["bag"], "wait_for": 1}], **common)
     simulator = Node(executable="simulator", name="simulator", condition=IfCondition(arg("simulate")), parameters=[
-        {"robot": text["robot"], "scene": "", "trajectory": text["trajectory"], "wait_for": 1}], **common)
+        {"robot": text["robot"], "scene": "none", "trajectory": text["trajectory"], "wait_for": 1}], **common)
     rviz = Node(package="rviz2", executable="rviz2", condition=IfCondition(arg("rviz")),
                 arguments=["-d", PathJoinSubstitution([SHARE, "rviz", "continuum_loc.rviz"])])
     declared = [DeclareLaunchArgument(name, default_value=value, description=text)

@@ -15,15 +15,15 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from rclpy.context import Context  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 
-from continuum_loc.measurements import EncoderSample, ImuSample, StrainSample, TofFrame, nanoseconds  # noqa: E402
-from continuum_loc.nodes.runtime import output_qos  # noqa: E402
-from continuum_loc.robot import load_robot  # noqa: E402
-from msg_tools.factory import ros_messages  # noqa: E402
-from msg_tools.topics import topic_spec  # noqa: E402
+from continuum_loc.measurements import EncoderSample, ImuSample, StrainSample, TofFrame, nanoseconds
+from continuum_loc.nodes.runtime import output_qos
+from continuum_loc.robot import load_robot
+from msg_tools.factory import ros_messages
+from msg_tools.topics import topic_spec
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 60.0  # s; generous: discovery alone may take seconds, and the machine may be busy

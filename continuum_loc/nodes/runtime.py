@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError  # rclpy gives it no public name
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -71,7 +72,11 @@ class PackageNode(Node):
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     """Make a node and spin it until it finishes or is told to stop. Returns the exit code (2: bad input)."""
     _provide_log_folder()
-    rclpy.init(args=args)
+    try:
+        rclpy.init(args=args)
+    except RCLError as error:  # arguments after --ros-args that ROS does not understand
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
     node: PackageNode | None = None
     try:
         node = make()

@@ -69,7 +69,7 @@ class SimulatorNodeSettings(Settings):
 
     robot: str = Field("engine", description="robot description: a bundled name or a YAML file")
     plant: str = Field("", description="plant: a bundled name or a YAML file; empty for the robot's own")
-    scene: str = Field("S0", description="scene: S0-S9, R0-R4, a mesh file, or empty for none")
+    scene: str = Field("S0", description="scene: S0-S9, R0-R4, a mesh file, or `none`")
     trajectory: str = Field("t1", description="name of the trajectory")
     profile: Literal["live", "full"] = Field("live", description="how finely the body is modelled")
     tof_fidelity: Literal["paper", "vl53l5cx"] = Field("paper", description="how the ToF sensors are modelled")

@@ -69,7 +69,7 @@ class SimulatorNode(PackageNode):
         from continuum_loc.simulator.world import World
 
         s = self.settings
-        scene = load_scene(s.scene) if s.scene else None
+        scene = None if s.scene == "none" else load_scene(s.scene)
         return World(self.robot, scene, s.trajectory, plant=s.plant or None, profile=s.profile,
                      tof_fidelity=s.tof_fidelity, seed=s.seed)
 
