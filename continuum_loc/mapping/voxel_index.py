@@ -9,8 +9,9 @@ A point p cannot be nearest anywhere in a box if another point p' is closer at a
 squared distances is linear in the query, so that its minimum over the box with centre c and edge h has a closed
 form:  min_q |q-p|^2 - |q-p'|^2 = |c-p|^2 - |c-p'|^2 - h (|g_x| + |g_y| + |g_z|),  g = p' - p.
 
-Lists are made when a cell is first visited, in memory of fixed size: when it is full it is emptied. Answers never
-depend on what the cache holds. Because queries write to it, use one index (`VoxelIndex.copy`) per thread.
+Lists are made when a cell has been visited a few times (until then the grid is searched), in memory of fixed size:
+when it is full it is emptied. Answers never depend on what the cache holds. Because queries write to it, use one
+index (`VoxelIndex.copy`) per thread.
 """
 
 from __future__ import annotations
@@ -24,13 +25,16 @@ from continuum_loc.mapping.errors import MapError
 
 BLOCK = 4  # voxels along a block's edge
 BLOCK_VOXELS = BLOCK**3
-POINTS_PER_VOXEL = 3.2  # mean over occupied voxels; makes lists of about 15, where their length and number balance
+POINTS_PER_VOXEL = 2.0  # mean over occupied voxels; makes lists of about 12, where their length and number balance
 AXIS_BITS = 21
 AXIS_MASK = (1 << AXIS_BITS) - 1
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
-FAR, CROWDED = -1, -2  # instead of a list's length: no point within reach; too many candidates
+FIRST_REACH = 0.75  # voxels that a search looks around at first
+PATIENCE = 4  # visits to a cell before it gets a list, which costs as much as a dozen searches
+CROWDED = -1000  # entry of a cell whose list would be too long
+ROUNDING = 1e-9  # far above the rounding of coordinates counted in voxels (2^20 of them at most)
 COUNTERS = 2  # rows after the cell table: [cells in use, pool rows in use], [lists made, times emptied]
 
 
@@ -42,7 +46,8 @@ class VoxelArrays(NamedTuple):
     points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by voxel.
     block_slots: (H, 2) hash table from a block's key to its number.
     voxel_start: (B * 64 + 1,) first sorted point of each voxel.
-    cell_slots: (C + COUNTERS, 2) hash table from a cell's key to its packed list (start * 2^16 + length + 2).
+    cell_slots: (C + COUNTERS, 2) hash table from a cell's key to its packed list (start * 2^16 + length), to minus
+        the number of visits so far, or to CROWDED.
     pool: (L, 4) the lists end to end: rows of `points`.
     x0, y0, z0: origin [m]; voxel: edge [m]; blocks_x, blocks_y, blocks_z: extent of the map in blocks;
     reach: distance [m] up to which lists are made.
@@ -131,40 +136,23 @@ def _fill_blocks(codes, keys, block_slots, voxel_start):
 
 
 @njit(cache=True, inline="always")
-def _axis_gap(x, low, high):
-    return max(low - x, x - high, 0.0)
-
-
-@njit(cache=True)
-def _block_distance2(arrays, key, x, y, z):
-    """Squared distance from a point to a block's box, a little less, so that rounding never rules out a hit."""
-    edge = arrays.voxel * BLOCK
-    x0 = arrays.x0 + (key >> (2 * AXIS_BITS)) * edge
-    y0 = arrays.y0 + ((key >> AXIS_BITS) & AXIS_MASK) * edge
-    z0 = arrays.z0 + (key & AXIS_MASK) * edge
-    gx = _axis_gap(x, x0, x0 + edge)
-    gy = _axis_gap(y, y0, y0 + edge)
-    gz = _axis_gap(z, z0, z0 + edge)
-    return (gx * gx + gy * gy + gz * gz) * (1.0 - 1e-9) - 1e-18
+def _gap2(u, block):
+    """Squared distance, along one axis and in voxels, from a place to a block."""
+    gap = max(block * BLOCK - u, u - (block + 1) * BLOCK, 0.0)
+    return gap * gap
 
 
 @njit(cache=True, inline="always")
-def _voxel_range(offset, radius, inverse_voxel, first):
-    """Half-open range 0..4 of a block's voxels, along one axis, that offset +- radius covers."""
-    radius = radius * (1.0 + 1e-9) + 1e-12
-    low = np.floor((offset - radius) * inverse_voxel) - first
-    high = np.floor((offset + radius) * inverse_voxel) - first
-    return int(max(low, 0.0)), int(min(high, BLOCK - 1.0)) + 1
+def _block_range(u, reach, count):
+    """Half-open range of blocks, of `count`, that u +- reach (in voxels) covers along one axis."""
+    low, high = np.floor((u - reach) / BLOCK), np.floor((u + reach) / BLOCK)
+    return int(max(low, 0.0)), int(max(min(high, count - 1.0), -1.0)) + 1
 
 
-@njit(cache=True)
-def _voxels_in_ball(arrays, key, x, y, z, radius):
-    """Half-open ranges of a block's voxels, per axis, that the ball's bounding box covers."""
-    inverse = arrays.inverse_voxel
-    i0, i1 = _voxel_range(x - arrays.x0, radius, inverse, (key >> (2 * AXIS_BITS)) * BLOCK)
-    j0, j1 = _voxel_range(y - arrays.y0, radius, inverse, ((key >> AXIS_BITS) & AXIS_MASK) * BLOCK)
-    k0, k1 = _voxel_range(z - arrays.z0, radius, inverse, (key & AXIS_MASK) * BLOCK)
-    return i0, i1, j0, j1, k0, k1
+@njit(cache=True, inline="always")
+def _voxel_range(u, radius):
+    """Half-open range, within 0..4, of a block's voxels that u +- radius covers; u in voxels from the block."""
+    return int(max(np.floor(u - radius), 0.0)), int(min(np.floor(u + radius), BLOCK - 1.0)) + 1
 
 
 @njit(cache=True, inline="always")
@@ -179,14 +167,16 @@ def _faces(normals, p, dx, dy, dz, min_cos):
 
 
 @njit(cache=True)
-def _scan_block(arrays, block, key, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
-    """Improve (best sorted point, squared distance) by the points of one block."""
-    points, start = arrays.points, arrays.voxel_start
-    i0, i1, j0, j1, k0, k1 = _voxels_in_ball(arrays, key, x, y, z, np.sqrt(best2))
+def _scan_block(points, start, normals, number, u, v, w, radius, x, y, z, dx, dy, dz, min_cos, best, best2):
+    """Improve (best sorted point, squared distance) by the points of one block in the voxels that the ball touches;
+    u, v, w: the place in voxels from the block's corner."""
+    i0, i1 = _voxel_range(u, radius)
+    j0, j1 = _voxel_range(v, radius)
+    k0, k1 = _voxel_range(w, radius)
     for i in range(i0, i1):
         for j in range(j0, j1):
             for k in range(k0, k1):
-                voxel = block * BLOCK_VOXELS + _voxel_in_block(i, j, k)
+                voxel = number * BLOCK_VOXELS + _voxel_in_block(i, j, k)
                 for p in range(start[voxel], start[voxel + 1]):
                     d2 = _distance2(points, p, x, y, z)
                     if d2 < best2 and (min_cos <= -1.0 or _faces(normals, int(points[p, 3]), dx, dy, dz, min_cos)):
@@ -194,46 +184,58 @@ def _scan_block(arrays, block, key, normals, x, y, z, dx, dy, dz, min_cos, best,
     return best, best2
 
 
+# What follows unpacks `arrays` once and counts in voxels from the origin: u, v, w are x, y, z so. Comparisons that may
+# rule something out give way by ROUNDING (relative, and in voxels), so that rounding never rules a neighbour out.
 @njit(cache=True)
 def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2):
-    """(best sorted point or -1, squared distance) of all blocks nearer than sqrt(best2), in shells outward.
-    With min_cos = -1 every point counts and `normals` is not read."""
-    slots, best = arrays.block_slots, -1
+    """(best sorted point or -1, squared distance) of the points nearer than sqrt(best2), in boxes that double until
+    one is sure to hold the nearest. With min_cos = -1 every point counts and `normals` is not read."""
+    points, slots, start, scale = arrays.points, arrays.block_slots, arrays.voxel_start, arrays.inverse_voxel
     nx, ny, nz = arrays.blocks_x, arrays.blocks_y, arrays.blocks_z
-    edge = arrays.voxel * BLOCK
-    ci = int(np.floor((x - arrays.x0) / edge))
-    cj = int(np.floor((y - arrays.y0) / edge))
-    ck = int(np.floor((z - arrays.z0) / edge))
-    first = max(-ci, ci - nx + 1, -cj, cj - ny + 1, -ck, ck - nz + 1, 0)
-    last = max(ci, nx - 1 - ci, cj, ny - 1 - cj, ck, nz - 1 - ck)
-    for shell in range(first, last + 1):
-        if shell > 1 and ((shell - 1) * edge) ** 2 * (1.0 - 1e-9) > best2:
-            break
-        if shell > 2 and (2 * shell + 1) ** 2 > slots.shape[0]:
+    u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
+    best = -1
+    farthest = BLOCK * (nx + ny + nz) + abs(u) + abs(v) + abs(w)
+    limit = min(np.sqrt(best2) * scale, farthest) * (1.0 + ROUNDING) + ROUNDING
+    to_map = max(-u, u - BLOCK * nx, -v, v - BLOCK * ny, -w, w - BLOCK * nz, 0.0)
+    reach = min(to_map + FIRST_REACH, limit)
+    while True:
+        i0, i1 = _block_range(u, reach, nx)
+        j0, j1 = _block_range(v, reach, ny)
+        k0, k1 = _block_range(w, reach, nz)
+        if (i1 - i0) * (j1 - j0) * (k1 - k0) > slots.shape[0]:
             return _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
-        for i in range(max(ci - shell, 0), min(ci + shell + 1, nx)):
-            for j in range(max(cj - shell, 0), min(cj + shell + 1, ny)):
-                on_side = abs(i - ci) == shell or abs(j - cj) == shell
-                for k in range(ck - shell, ck + shell + 1, 1 if on_side else 2 * shell):
-                    key = _pack(i, j, k)
-                    if k < 0 or k >= nz or _block_distance2(arrays, key, x, y, z) >= best2:
+        radius = min(np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING, reach)
+        for i in range(i0, i1):
+            for j in range(j0, j1):
+                gap_ij = _gap2(u, i) + _gap2(v, j)
+                if gap_ij > radius * radius:
+                    continue
+                for k in range(k0, k1):
+                    if gap_ij + _gap2(w, k) > radius * radius:
                         continue
+                    key = _pack(i, j, k)
                     row = _find_slot(slots, key, slots.shape[0] - 1)
                     if slots[row, 0] == key:
-                        best, best2 = _scan_block(
-                            arrays, slots[row, 1], key, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
-    return best, best2
+                        best, best2 = _scan_block(points, start, normals, slots[row, 1], u - BLOCK * i, v - BLOCK * j,
+                                                  w - BLOCK * k, radius, x, y, z, dx, dy, dz, min_cos, best, best2)
+                        radius = min(np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING, reach)
+        if radius < reach or reach >= limit:
+            return best, best2
+        reach = min(2.0 * reach, limit)
 
 
 @njit(cache=True)
 def _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
     """Go on with `_search` over the table of blocks: cheaper than empty space once that is the larger of the two."""
-    slots = arrays.block_slots
+    points, slots, start, scale = arrays.points, arrays.block_slots, arrays.voxel_start, arrays.inverse_voxel
+    u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
     for row in range(slots.shape[0]):
         key = slots[row, 0]
-        if key >= 0 and _block_distance2(arrays, key, x, y, z) < best2:
-            best, best2 = _scan_block(
-                arrays, slots[row, 1], key, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
+        i, j, k = key >> (2 * AXIS_BITS), (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
+        radius = np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING
+        if key >= 0 and _gap2(u, i) + _gap2(v, j) + _gap2(w, k) <= radius * radius:
+            best, best2 = _scan_block(points, start, normals, slots[row, 1], u - BLOCK * i, v - BLOCK * j,
+                                      w - BLOCK * k, radius, x, y, z, dx, dy, dz, min_cos, best, best2)
     return best, best2
 
 
@@ -252,39 +254,45 @@ def _gather(arrays, x, y, z, radius, used):
     """Write to the pool, after row `used`, the points within `radius` that row `used` does not rule out (row `used`
     itself is among them, so it is written twice and the first one dropped by the caller). The end of what was
     written, or -1 when there are more than GATHER_LIMIT."""
-    slots, end = arrays.block_slots, used + 1
-    edge = arrays.voxel * BLOCK
-    for i in range(max(int(np.floor((x - radius - arrays.x0) / edge)), 0),
-                   min(int(np.floor((x + radius - arrays.x0) / edge)) + 1, arrays.blocks_x)):
-        for j in range(max(int(np.floor((y - radius - arrays.y0) / edge)), 0),
-                       min(int(np.floor((y + radius - arrays.y0) / edge)) + 1, arrays.blocks_y)):
-            for k in range(max(int(np.floor((z - radius - arrays.z0) / edge)), 0),
-                           min(int(np.floor((z + radius - arrays.z0) / edge)) + 1, arrays.blocks_z)):
-                key = _pack(i, j, k)
-                if _block_distance2(arrays, key, x, y, z) > radius * radius:
+    points, slots, start, scale = arrays.points, arrays.block_slots, arrays.voxel_start, arrays.inverse_voxel
+    pool, edge, end = arrays.pool, arrays.voxel, used + 1
+    u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
+    reach = radius * scale * (1.0 + ROUNDING) + ROUNDING
+    i0, i1 = _block_range(u, reach, arrays.blocks_x)
+    j0, j1 = _block_range(v, reach, arrays.blocks_y)
+    k0, k1 = _block_range(w, reach, arrays.blocks_z)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            gap_ij = _gap2(u, i) + _gap2(v, j)
+            for k in range(k0, k1):
+                if gap_ij + _gap2(w, k) > reach * reach:
                     continue
+                key = _pack(i, j, k)
                 row = _find_slot(slots, key, slots.shape[0] - 1)
                 if slots[row, 0] == key:
-                    end = _gather_block(arrays, slots[row, 1], key, x, y, z, radius, used, end)
+                    end = _gather_block(points, start, pool, slots[row, 1], u - BLOCK * i, v - BLOCK * j,
+                                        w - BLOCK * k, reach, x, y, z, edge, used, end)
                     if end < 0:
                         return end
     return end
 
 
 @njit(cache=True)
-def _gather_block(arrays, block, key, x, y, z, radius, used, end):
-    points, pool, start, edge = arrays.points, arrays.pool, arrays.voxel_start, arrays.voxel
-    i0, i1, j0, j1, k0, k1 = _voxels_in_ball(arrays, key, x, y, z, radius)
+def _gather_block(points, start, pool, number, u, v, w, reach, x, y, z, edge, used, end):
+    i0, i1 = _voxel_range(u, reach)
+    j0, j1 = _voxel_range(v, reach)
+    k0, k1 = _voxel_range(w, reach)
     for i in range(i0, i1):
         for j in range(j0, j1):
             for k in range(k0, k1):
-                voxel = block * BLOCK_VOXELS + _voxel_in_block(i, j, k)
+                voxel = number * BLOCK_VOXELS + _voxel_in_block(i, j, k)
                 for p in range(start[voxel], start[voxel + 1]):
                     if _never_nearest(points, p, pool, used, x, y, z, edge):
                         continue
                     if end - used > GATHER_LIMIT:
                         return -1
-                    pool[end] = points[p]
+                    for column in range(4):
+                        pool[end, column] = points[p, column]
                     end += 1
     return end
 
@@ -307,7 +315,8 @@ def _prune(pool, used, end, x, y, z, edge):
         kept = used + 1
         for c in range(used + 1, end):
             if not _never_nearest(pool, c, pool, used, x, y, z, edge):
-                pool[kept] = pool[c]
+                for column in range(4):
+                    pool[kept, column] = pool[c, column]
                 kept += 1
         end = kept
     return end
@@ -315,56 +324,80 @@ def _prune(pool, used, end, x, y, z, edge):
 
 @njit(cache=True)
 def _make_list(arrays, x, y, z, used):
-    """Write the candidate list of the cell with this centre at pool row `used`: its length, or FAR or CROWDED."""
+    """Write the candidate list of the cell with this centre at pool row `used`: its length (0: no point within
+    reach), or -1 where it would be too long."""
     half_diagonal = 0.5 * np.sqrt(3.0) * arrays.voxel
     limit = arrays.reach + half_diagonal
     best, best2 = _search(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, limit * limit)
     if best < 0:
-        return FAR
+        return 0
     # Every query of the cell has a point within |c - best| + half diagonal of it.
     radius = np.sqrt(best2) + 2.0 * half_diagonal * (1.0 + 1e-9)
     arrays.pool[used] = arrays.points[best]
     end = _gather(arrays, x, y, z, radius, used)
     if end < 0:
-        return CROWDED
+        return -1
     arrays.pool[used] = arrays.pool[end - 1]  # the second copy of `best` is still among them
     length = _prune(arrays.pool, used, end - 1, x, y, z, arrays.voxel) - used
-    return length if length <= LIST_LIMIT else CROWDED
+    return length if length <= LIST_LIMIT else -1
+
+
+@njit(cache=True)
+def _visit(arrays, key, row):
+    """Count a visit to a cell that has no list, in row `row` of the table; from the PATIENCE-th on it gets one.
+    The cell's entry."""
+    slots = arrays.cell_slots
+    table = slots.shape[0] - COUNTERS
+    if slots[row, 0] != key:
+        if slots[table, 0] * 2 >= table:
+            _empty(slots)
+            row = _find_slot(slots, key, table - 1)
+        slots[row, 0], slots[row, 1] = key, 0
+        slots[table, 0] += 1
+    if slots[row, 1] == CROWDED:
+        return CROWDED
+    slots[row, 1] -= 1
+    if slots[row, 1] <= -PATIENCE:
+        if slots[table, 1] + GATHER_LIMIT + 2 > arrays.pool.shape[0]:
+            _empty(slots)
+            return np.int64(-1)
+        slots[row, 1] = _add_list(arrays, key)
+    return slots[row, 1]
+
+
+@njit(cache=True)
+def _empty(slots):
+    table = slots.shape[0] - COUNTERS
+    slots[:table, 0] = -1
+    slots[table] = 0
+    slots[table + 1, 1] += 1
 
 
 @njit(cache=True)
 def _add_list(arrays, key):
-    """Make and store the list of a cell not seen before; its packed entry. Empties the cache first when it is full."""
-    slots = arrays.cell_slots
-    table = slots.shape[0] - COUNTERS
-    if slots[table, 0] * 2 > table or slots[table, 1] + GATHER_LIMIT + 2 > arrays.pool.shape[0]:
-        slots[:table, 0] = -1
-        slots[table] = 0
-        slots[table + 1, 1] += 1
+    """Make the list of a cell; its packed entry, or CROWDED."""
+    counters = arrays.cell_slots[-COUNTERS:]
     x = arrays.x0 + ((key >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * arrays.voxel
     y = arrays.y0 + (((key >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.voxel
     z = arrays.z0 + ((key & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.voxel
-    start = slots[table, 1]
+    start = counters[0, 1]
     length = _make_list(arrays, x, y, z, start)
-    entry = (start << 16) + length + 2
-    row = _find_slot(slots, key, table - 1)
-    slots[row, 0], slots[row, 1] = key, entry
-    slots[table, 0] += 1
-    slots[table, 1] += max(length, 0)
-    slots[table + 1, 0] += 1
-    return entry
+    counters[1, 0] += 1
+    if length < 0:
+        return np.int64(CROWDED)
+    counters[0, 1] += length
+    return (start << 16) + length
 
 
-@njit(cache=True, inline="always")
-def _cell_key(arrays, x, y, z):
+@njit(cache=True)
+def _cell_key(x0, y0, z0, inverse_voxel, x, y, z):
     """Key of the cell that holds a place; -1 for nan and for places absurdly far away."""
-    i = np.floor((x - arrays.x0) * arrays.inverse_voxel)
-    j = np.floor((y - arrays.y0) * arrays.inverse_voxel)
-    k = np.floor((z - arrays.z0) * arrays.inverse_voxel)
-    key = np.int64(-1)
-    if abs(i) < AXIS_LIMIT and abs(j) < AXIS_LIMIT and abs(k) < AXIS_LIMIT:
-        key = _pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT)
-    return key
+    i = np.floor((x - x0) * inverse_voxel)
+    j = np.floor((y - y0) * inverse_voxel)
+    k = np.floor((z - z0) * inverse_voxel)
+    if not (abs(i) < AXIS_LIMIT and abs(j) < AXIS_LIMIT and abs(k) < AXIS_LIMIT):
+        return np.int64(-1)
+    return _pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT)
 
 
 @njit(cache=True)
@@ -372,7 +405,7 @@ def _nearest_listed(pool, entry, x, y, z, limit2):
     """Nearest of a cell's candidates: (pool row or -1, squared distance)."""
     best, best2 = -1, limit2
     start = entry >> 16
-    for c in range(start, start + (entry & 0xFFFF) - 2):
+    for c in range(start, start + (entry & 0xFFFF)):
         d2 = _distance2(pool, c, x, y, z)
         if d2 < best2:
             best, best2 = c, d2
@@ -380,16 +413,17 @@ def _nearest_listed(pool, entry, x, y, z, limit2):
 
 
 @njit(cache=True)
-def _nearest_unlisted(arrays, key, row, x, y, z, max_distance):
-    """`nearest` where the cell has no usable list yet: make one, or search where none can be made."""
-    entry = arrays.cell_slots[row, 1] if arrays.cell_slots[row, 0] == key else _add_list(arrays, key)
-    length = (entry & 0xFFFF) - 2
-    if length >= 0:
-        best, best2 = _nearest_listed(arrays.pool, entry, x, y, z, max_distance * max_distance)
-        return (np.int64(arrays.pool[best, 3]), best2) if best >= 0 else (np.int64(-1), np.inf)
-    if length == FAR and max_distance <= arrays.reach:
-        return np.int64(-1), np.inf
-    return _nearest_searched(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, max_distance * max_distance)
+def _nearest_facing_listed(pool, normals, entry, x, y, z, dx, dy, dz, min_cos, limit2):
+    """Nearest of a cell's candidates that face: (pool row or -1, squared distance, whether none is nearer)."""
+    best, best2, any2 = -1, limit2, limit2
+    start = entry >> 16
+    for c in range(start, start + (entry & 0xFFFF)):
+        d2 = _distance2(pool, c, x, y, z)
+        if d2 < any2:
+            any2 = d2
+        if d2 < best2 and _faces(normals, int(pool[c, 3]), dx, dy, dz, min_cos):
+            best, best2 = c, d2
+    return best, best2, any2 >= best2
 
 
 @njit(cache=True)
@@ -405,16 +439,20 @@ def nearest(arrays, x, y, z, max_distance):
     """(row of the nearest point in the caller's cloud, squared distance [m^2]), or (-1, inf) when none lies
     strictly within `max_distance` [m] or the query is not finite."""
     index, distance2 = np.int64(-1), np.inf
-    key = _cell_key(arrays, x, y, z)
+    key = _cell_key(arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel, x, y, z)
     if key >= 0:
         slots = arrays.cell_slots
         row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
-        if slots[row, 0] == key and (slots[row, 1] & 0xFFFF) >= 2:
-            best, best2 = _nearest_listed(arrays.pool, slots[row, 1], x, y, z, max_distance * max_distance)
+        entry = slots[row, 1]
+        if slots[row, 0] != key or entry < 0:
+            entry = _visit(arrays, key, row)
+        if entry >= 0 and ((entry & 0xFFFF) > 0 or max_distance <= arrays.reach):
+            best, best2 = _nearest_listed(arrays.pool, entry, x, y, z, max_distance * max_distance)
             if best >= 0:
                 index, distance2 = np.int64(arrays.pool[best, 3]), best2
         else:
-            index, distance2 = _nearest_unlisted(arrays, key, row, x, y, z, max_distance)
+            index, distance2 = _nearest_searched(
+                arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, max_distance * max_distance)
     return index, distance2
 
 
@@ -423,28 +461,27 @@ def nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
     """As `nearest`, among the points whose outward normal n has -(n . d) >= min_cos.
 
     normals: (P, 3) in the caller's order; d = (dx, dy, dz): unit direction of the ray, so that it hits the surface
-    from its outside. The nearest point of all is the answer where it faces, which is the common case.
+    from its outside. The list holds the nearest of all: where that one faces it is the answer, which is the common
+    case. Otherwise the nearest facing candidate bounds the distance within which the grid is searched.
     """
-    index, distance2 = nearest(arrays, x, y, z, max_distance)
-    if index >= 0 and not _faces(normals, index, dx, dy, dz, min_cos):
-        index, distance2 = _search_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos)
-    return index, distance2
-
-
-@njit(cache=True)
-def _search_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
-    """`nearest_facing` where the nearest point does not face: the facing ones among the cell's candidates bound the
-    distance, and the grid is searched within that."""
-    slots, pool = arrays.cell_slots, arrays.pool
-    best, best2 = np.int64(-1), max_distance * max_distance
-    entry = slots[_find_slot(slots, _cell_key(arrays, x, y, z), slots.shape[0] - COUNTERS - 1), 1]
-    for c in range(entry >> 16, (entry >> 16) + max((entry & 0xFFFF) - 2, 0)):
-        d2 = _distance2(pool, c, x, y, z)
-        if d2 < best2 and _faces(normals, int(pool[c, 3]), dx, dy, dz, min_cos):
-            best, best2 = np.int64(pool[c, 3]), d2
-    index, distance2 = _nearest_searched(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2)
-    if index < 0 and best >= 0:
-        index, distance2 = best, best2
+    index, distance2 = np.int64(-1), np.inf
+    key = _cell_key(arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel, x, y, z)
+    if key >= 0:
+        limit2, done = max_distance * max_distance, False
+        slots = arrays.cell_slots
+        row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
+        entry = slots[row, 1]
+        if slots[row, 0] != key or entry < 0:
+            entry = _visit(arrays, key, row)
+        if entry >= 0 and ((entry & 0xFFFF) > 0 or max_distance <= arrays.reach):
+            best, limit2, done = _nearest_facing_listed(
+                arrays.pool, normals, entry, x, y, z, dx, dy, dz, min_cos, limit2)
+            if best >= 0:
+                index, distance2 = np.int64(arrays.pool[best, 3]), limit2
+        if not done:
+            nearer, nearer2 = _nearest_searched(arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2)
+            if nearer >= 0:
+                index, distance2 = nearer, nearer2
     return index, distance2
 
 
@@ -466,13 +503,13 @@ class VoxelIndex:
     """Nearest-neighbour index of a fixed cloud; see the module's docstring for how it works.
 
     points: (P, 3) [m], finite, P >= 1. normals: (P, 3) unit, needed for `nearest_facing`.
-    voxel: edge of a voxel [m], by default so that an occupied one holds about three points.
+    voxel: edge of a voxel [m], by default so that an occupied one holds two points or so.
     reach: largest distance [m] that is served at full speed; larger ones are exact too, but searched for.
     cache_cells: candidate lists kept at a time (about 0.5 kB each).
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray | None = None, voxel: float | None = None,
-                 reach: float = 0.1, cache_cells: int = 1 << 17):
+                 reach: float = 0.1, cache_cells: int = 1 << 16):
         points = _checked_rows(points, "points")
         self.normals = points if normals is None else _checked_rows(normals, "normals")
         if self.normals.shape != points.shape:
