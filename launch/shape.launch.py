@@ -17,7 +17,7 @@ ARGUMENTS = (
     ("robot", "hall_arm", "robot description: a bundled name or a YAML file"),
     ("bag", "", "bag to play; empty waits for live sensors"),
     ("simulate", "false", "simulate the arm"),
-    ("trajectory", "free", "named motion of the simulated arm"),
+    ("trajectory", "free1", "named motion of the simulated arm"),
     ("rviz", "false", "start RViz"),
     ("params_file", PathJoinSubstitution([SHARE, "config", "shape.yaml"]), "parameters of node `shape` (YAML)"),
     ("use_sim_time", "false", "take the time from /clock; set it to true with a bag"),

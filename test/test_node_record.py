@@ -99,7 +99,8 @@ def test_a_recorder_that_is_terminated_leaves_a_bag_that_can_be_read(tmp_path):
 
 def test_bad_input_ends_in_one_clear_line(recorded, tmp_path):
     bag = recorded[0]
-    cases = (("simulator", {"scene": "S99"}, "S99"), ("simulator", {"scene": ""}, "parameter override"), ("simulator", {"trajectory": "t99"}, "t99"),
+    cases = (("simulator", {"scene": "S99"}, "S99"), ("simulator", {"scene": ""}, "parameter override"),
+             ("simulator", {"trajectory": "t99"}, "t99"),
              ("replayer", {"bag": tmp_path / "absent"}, "absent"), ("recorder", {"bag": bag}, "exists already"),
              ("replayer", {"bag": bag, "topics": "[nowhere]"}, "no topic 'nowhere'"))
     nodes = [Process(node, fresh_domain(), tmp_path, **parameters) for node, parameters, _ in cases]

@@ -1,0 +1,56 @@
+"""Node `shape` as a process: a straight Hall + IMU arm at rest, then bent, from the analytic simulation."""
+
+import signal
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from node_graph import Client, Process, fresh_domain
+from std_srvs.srv import Trigger
+
+from continuum_loc.robot import load_robot
+
+pytestmark = pytest.mark.timeout(300)
+OUTPUTS = ("shape/poses", "shape/curve", "/diagnostics")
+
+
+def test_the_simulated_arm_is_followed_live(tmp_path):
+    domain = fresh_domain()
+    node = Process("shape", domain, tmp_path, diagnostics_rate=5)
+    node.await_log("ready:")
+    robot = load_robot("hall_arm")
+    with Client(domain) as client:
+        for topic in (*OUTPUTS, "ground_truth/poses"):
+            client.hear(topic)
+        simulator = Process("simulator", domain, tmp_path, robot="hall_arm", scene="none", trajectory="free1",
+                            duration=4, wait_for=1)
+        assert client.until(lambda: simulator.popen.poll() is not None)
+        assert simulator.wait() == 0, simulator.log
+        assert client.until(lambda: all(client.heard[topic] for topic in OUTPUTS)), node.log
+        poses, truth = client.heard["shape/poses"], client.heard["ground_truth/poses"]
+        assert len(poses) > 40 and all(len(pose.T_map_body) == len(robot.hall) for pose in poses)
+        assert _error(poses, truth) < 0.003
+        curve = client.heard["shape/curve"][-1].T_map_backbone
+        np.testing.assert_allclose(np.linalg.det(curve[:, :3, :3]), 1.0, atol=1e-6)
+        along = np.einsum("ij,ij->i", curve[:-1, :3, 0], np.diff(curve[:, :3, 3], axis=0))
+        assert (along > 0.0).all()  # the frames' x points along the curve
+        name, _, _, values = client.heard["/diagnostics"][-1].statuses[0]
+        assert "hall_arm" in name and "faults" in values
+        assert client.call(Trigger, "shape/reset", Trigger.Request()).success
+    assert node.stop(signal.SIGTERM) == 0 and "Traceback" not in node.log, node.log
+
+
+def _error(poses, truth):
+    """Median over time of the worst module's position error [m]."""
+    true = {sample.stamp: sample.T_map_ring for sample in truth}
+    stamps = np.array(sorted(true))
+    worst = []
+    for pose in poses:
+        nearest = stamps[np.argmin(np.abs(stamps - pose.stamp))]
+        if abs(nearest - pose.stamp) < 20_000_000:
+            difference = pose.T_map_body[:, :3, 3] - true[int(nearest)][1:, :3, 3]
+            worst.append(np.linalg.norm(difference, axis=1).max())
+    assert len(worst) > 30
+    return float(np.median(worst))
