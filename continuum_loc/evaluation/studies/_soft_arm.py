@@ -16,10 +16,10 @@ FIDELITIES = ("paper", "vl53l5cx")
 
 
 def soft_arm_trials(quick: bool, seed: int) -> list[Trial]:
-    """All 61 combinations in both fidelities (`quick`: six seconds of one trajectory, one pair of each kind)."""
+    """All 61 combinations in both fidelities (`quick`: four seconds of one trajectory, one pair of each kind)."""
     if quick:
         return [Trial("soft_arm", scene, "b2", map_scene, fidelity=fidelity, disturbed=fidelity != "paper", seed=seed,
-                      duration=6.0)
+                      duration=4.0)
                 for fidelity in FIDELITIES for map_scene, scene in (MATCHING[1], ADDED[0], REMOVED[1])]
     # Every scene and trajectory has noise of its own: equal names of trajectories are no equal data.
     return [Trial("soft_arm", scene, trajectory, map_scene, profile="full", fidelity=fidelity,
