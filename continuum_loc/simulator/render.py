@@ -17,11 +17,16 @@ from continuum_loc.robot import RobotDescription, load_robot
 from continuum_loc.simulator.scenes import Scene, load_scene
 from continuum_loc.simulator.world import World
 
-BODY, RING, SENSOR, ANOMALY = (0.93, 0.55, 0.20), (0.25, 0.27, 0.30), (0.98, 0.85, 0.15), (0.85, 0.16, 0.20)
-SCENE, SKY = (0.62, 0.70, 0.78), (1.0, 1.0, 1.0)
-AMBIENT, SHADOW, SHADOW_LENGTH = 0.35, 0.55, 0.3  # shadows of what is near only: inside, all is in the dark
+BODY, RING, SENSOR = (0.93, 0.55, 0.20), (0.25, 0.27, 0.30), (0.98, 0.85, 0.15)
+ADDED, MISSING = (0.85, 0.12, 0.16), (0.50, 0.20, 0.78)
+SCENE, SKY = (0.66, 0.73, 0.80), (1.0, 1.0, 1.0)
+PAINT = {"casing": (0.55, 0.60, 0.66), "hub": (0.40, 0.45, 0.52), "box": (0.86, 0.85, 0.82),
+         "mustard_bottle": (0.93, 0.78, 0.12), "cup": (0.20, 0.48, 0.75), "cracker_box": (0.78, 0.20, 0.18),
+         "wet_floor_sign": (0.97, 0.88, 0.20)}
+AMBIENT, SHADOW, SHADOW_LENGTH = 0.45, 0.55, 0.3  # shadows of what is near only: inside, all is in the dark
+DAYLIGHT, DAYLIGHT_REACH = 8, 0.15  # rays per sample for `draw`; what is farther than this hides no sky [m]
 SUPERSAMPLE = 2
-SIDES = 24
+SIDES = 48
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +72,12 @@ class Shape:
     colour: tuple[float, float, float]
 
 
-def render(shapes: list[Shape], camera: Camera) -> np.ndarray:
-    """(H, W, 3) uint8 image: one light from the camera's upper left, with shadows."""
+def render(shapes: list[Shape], camera: Camera, daylight: int = 0) -> np.ndarray:
+    """(H, W, 3) uint8 image: one light from the camera's upper left, with shadows.
+
+    daylight: rays per sample that ask how much of the sky within `DAYLIGHT_REACH` each surface sees, which shades
+    corners; 0 leaves all surfaces in even light, and is quick.
+    """
     import open3d as o3d
 
     caster = o3d.t.geometry.RaycastingScene()
@@ -85,10 +94,13 @@ def render(shapes: list[Shape], camera: Camera) -> np.ndarray:
     points = eye + np.where(hit, distance, 0.0)[..., None] * rays + 1e-4 * normals
     towards = np.concatenate([points, np.broadcast_to(light, points.shape)], axis=-1).astype(np.float32)
     shadowed = caster.test_occlusions(o3d.core.Tensor(towards), tfar=SHADOW_LENGTH).numpy()
-    brightness = AMBIENT + (1.0 - AMBIENT) * np.clip(normals @ light, 0.0, 1.0) * np.where(shadowed, SHADOW, 1.0)
+    ambient = AMBIENT * (_daylight(caster, points, normals, daylight) if daylight else 1.0)
+    lit = np.clip(normals @ light, 0.0, 1.0) * np.where(shadowed, SHADOW, 1.0)
+    facing = -np.sum(normals * rays, axis=-1)  # a lamp at the camera
+    brightness = ambient + (1.0 - AMBIENT) * (0.7 * lit + 0.4 * facing)
     palette = np.array([shape.colour for shape in shapes])
     colour = palette[np.where(hit, hits["geometry_ids"].numpy(), 0).astype(int)] * brightness[..., None]
-    image = np.where(hit[..., None], colour, SKY)
+    image = np.where(hit[..., None], np.minimum(colour, 1.0), SKY)
     blocks = image.reshape(camera.height, SUPERSAMPLE, camera.width, SUPERSAMPLE, 3)
     return (255.0 * blocks.mean(axis=(1, 3))).astype(np.uint8)
 
@@ -106,11 +118,28 @@ def robot_shapes(robot: RobotDescription, T_map_backbone: np.ndarray, T_map_ring
 
 
 def scene_shapes(scene: Scene) -> list[Shape]:
-    """The scene, with what was added to it in red."""
-    added = {anomaly.name for anomaly in scene.anomalies if anomaly.kind == "added"}
-    new = np.isin(scene.face_object, [k for k, name in enumerate(scene.objects) if name in added])
-    parts = [Shape(scene.vertices, scene.faces[~new], SCENE)]
-    return parts + ([Shape(scene.vertices, scene.faces[new], ANOMALY)] if new.any() else [])
+    """The scene in its parts' colours; in the engine, what was added to it and what is missing from it stand out."""
+    added = {anomaly.name for anomaly in scene.anomalies if anomaly.kind == "added"} - set(PAINT)
+    colours = [ADDED if name in added else PAINT.get(name, SCENE) for name in scene.objects]
+    palette = sorted(set(colours))
+    shade = np.array([palette.index(colour) for colour in colours])[scene.face_object]
+    gone = [Shape(a.vertices, a.faces, MISSING) for a in scene.anomalies if a.kind == "missing"]
+    return [Shape(scene.vertices, scene.faces[shade == k], colour) for k, colour in enumerate(palette)] + gone
+
+
+def _daylight(caster, points: np.ndarray, normals: np.ndarray, rays: int) -> np.ndarray:
+    """(H, W) share of the sky above each surface that nothing within `DAYLIGHT_REACH` hides."""
+    import open3d as o3d
+
+    rng, free = np.random.default_rng(0), np.zeros(points.shape[:2])
+    for _ in range(rays):
+        sphere = rng.standard_normal(points.shape).astype(np.float32)
+        sphere /= np.linalg.norm(sphere, axis=-1, keepdims=True)
+        up = normals + sphere  # directions crowd about the normal as their cosine
+        up /= np.maximum(np.linalg.norm(up, axis=-1, keepdims=True), 1e-6)
+        ray = np.concatenate([points, up], axis=-1).astype(np.float32)
+        free += ~caster.test_occlusions(o3d.core.Tensor(ray), tfar=DAYLIGHT_REACH).numpy()
+    return free / rays
 
 
 def _light(camera: Camera) -> np.ndarray:
@@ -145,11 +174,11 @@ def _box(T_map_box: np.ndarray, half: float, colour: tuple[float, float, float])
 
 # What to draw: robot, trajectory, moment [s], scene (None: the robot alone), camera.
 _ENGINE = Camera((-0.3, -1.9, 1.35), (0.85, 0.0, 0.95), fov_deg=60.0, section=-0.12)
-_BOX = Camera((-0.35, -1.35, 0.5), (0.0, 0.0, 0.28), fov_deg=40.0, section=-0.3)
+_BOX = Camera((0.38, -1.40, 0.80), (0.03, 0.0, 0.26), fov_deg=41.0, section=-0.345)
 PICTURES = {
     "robot_engine": ("engine", "t1", 13.0, None, Camera((0.2, -2.2, 1.4), (0.8, 0.0, 0.95), fov_deg=40.0)),
     "robot_soft_arm": ("soft_arm", "b5", 9.0, None, Camera((-0.5, -1.0, 0.5), (0.05, 0.0, 0.38), fov_deg=40.0)),
-    "robot_hall_arm": ("hall_arm", "groove80", 8.0, None, Camera((0.02, -0.25, 0.08), (0.02, 0.0, 0.03), fov_deg=35.0)),
+    "robot_hall_arm": ("hall_arm", "groove80", 8.0, None, Camera((0.05, -0.25, 0.07), (0.045, 0.0, 0.028), 32.0)),
     **{f"scene_S{k}": ("engine", "t1", 13.0, f"S{k}", _ENGINE) for k in range(10)},
     **{f"scene_R{k}": ("soft_arm", "b5", 9.0, f"R{k}", _BOX) for k in range(5)},
 }
@@ -165,7 +194,7 @@ def draw(name: str) -> np.ndarray:
         pass
     backbone = world.full_state(np.linspace(0.0, robot.length, 201))
     shapes = robot_shapes(robot, backbone, world.full_state(robot.ring_arclengths))
-    return render(shapes + (scene_shapes(scene) if scene else []), camera)
+    return render(shapes + (scene_shapes(scene) if scene else []), camera, DAYLIGHT)
 
 
 def main() -> None:
@@ -177,7 +206,7 @@ def main() -> None:
     names = sys.argv[2:] or list(PICTURES)
     out.mkdir(parents=True, exist_ok=True)
     for name in track(names, description="drawing"):
-        Image.fromarray(draw(name)).save(out / f"{name}.png", optimize=True)
+        Image.fromarray(draw(name)).save(out / f"{name}.jpg", quality=88)
 
 
 if __name__ == "__main__":
