@@ -486,17 +486,47 @@ def nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
 
 
 @njit(cache=True)
-def _nearest_batch(arrays, queries, max_distance, index, distance2):
+def _stored_list(slots, key):
+    """A cell's packed list, or -1 where there is none (yet)."""
+    if key < 0:
+        return np.int64(-1)
+    row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
+    return slots[row, 1] if slots[row, 0] == key else np.int64(-1)
+
+
+# The batches unpack `arrays` once and not per lookup, which halves the time of a lookup that finds its list.
+@njit(cache=True)
+def nearest_batch(arrays, queries, max_distance, index, distance2):
+    """`nearest` for queries (Q, 3), into index (Q,) and distance2 (Q,)."""
+    slots, pool, within = arrays.cell_slots, arrays.pool, max_distance <= arrays.reach
+    x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel
     for q in range(queries.shape[0]):
-        index[q], distance2[q] = nearest(arrays, queries[q, 0], queries[q, 1], queries[q, 2], max_distance)
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        entry = _stored_list(slots, _cell_key(x0, y0, z0, inverse, x, y, z))
+        if entry >= 0 and ((entry & 0xFFFF) > 0 or within):
+            best, best2 = _nearest_listed(pool, entry, x, y, z, max_distance * max_distance)
+            index[q] = np.int64(pool[best, 3]) if best >= 0 else -1
+            distance2[q] = best2 if best >= 0 else np.inf
+        else:
+            index[q], distance2[q] = nearest(arrays, x, y, z, max_distance)
 
 
 @njit(cache=True)
-def _nearest_facing_batch(arrays, normals, queries, directions, max_distance, min_cos, index, distance2):
+def nearest_facing_batch(arrays, normals, queries, directions, max_distance, min_cos, index, distance2):
+    """`nearest_facing` for queries (Q, 3) along directions (Q, 3), into index (Q,) and distance2 (Q,)."""
+    slots, pool, within = arrays.cell_slots, arrays.pool, max_distance <= arrays.reach
+    x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel
     for q in range(queries.shape[0]):
-        index[q], distance2[q] = nearest_facing(
-            arrays, normals, queries[q, 0], queries[q, 1], queries[q, 2],
-            directions[q, 0], directions[q, 1], directions[q, 2], max_distance, min_cos)
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
+        entry, done = _stored_list(slots, _cell_key(x0, y0, z0, inverse, x, y, z)), False
+        if entry >= 0 and ((entry & 0xFFFF) > 0 or within):
+            best, best2, done = _nearest_facing_listed(
+                pool, normals, entry, x, y, z, dx, dy, dz, min_cos, max_distance * max_distance)
+            index[q] = np.int64(pool[best, 3]) if best >= 0 else -1
+            distance2[q] = best2 if best >= 0 else np.inf
+        if not done:
+            index[q], distance2[q] = nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos)
 
 
 class VoxelIndex:
@@ -539,7 +569,7 @@ class VoxelIndex:
         """Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3); -1 and inf where none."""
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
-        _nearest_batch(self.arrays, queries, float(max_distance), index, distance2)
+        nearest_batch(self.arrays, queries, float(max_distance), index, distance2)
         return index, np.sqrt(distance2)
 
     def nearest_facing(self, queries: np.ndarray, directions: np.ndarray, max_distance: float = np.inf,
@@ -550,8 +580,8 @@ class VoxelIndex:
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         directions = np.ascontiguousarray(np.broadcast_to(directions, queries.shape), dtype=np.float64)
         index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
-        _nearest_facing_batch(self.arrays, self.normals, queries, directions, float(max_distance), float(min_cos),
-                              index, distance2)
+        nearest_facing_batch(self.arrays, self.normals, queries, directions, float(max_distance), float(min_cos),
+                             index, distance2)
         return index, np.sqrt(distance2)
 
 
