@@ -17,7 +17,16 @@ from continuum_loc.robot import RobotDescription, load_robot
 from continuum_loc.shape import ShapeEstimate, ShapeEstimator, ShapeSettings, curves
 from continuum_loc.shape.calibration import Calibration, calibrate, nominal_calibration
 from continuum_loc.shape.paper import MENDS, Background, PaperEstimate, paper_pipeline
-from continuum_loc.shape.simulate import GROOVES, Arm, Imperfections, bent, groove_motion, out_of_plane, s_shape
+from continuum_loc.shape.simulate import (
+    GROOVES,
+    Arm,
+    Imperfections,
+    Motion,
+    bent,
+    groove_motion,
+    out_of_plane,
+    s_shape,
+)
 
 SPAN = 0.075  # m, from the magnet to the last module: the part of the robot that the paper's curves cover
 FRACTIONS = np.linspace(0.0, 1.0, 151)
@@ -39,10 +48,10 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     robot = load_robot("hall_arm")
-    seeds = seed + np.arange(4 if quick else 24)
+    seeds = seed + np.arange(2 if quick else 12)
     grooves = _per_arm(_groove_rows, seeds, jobs)
-    printed = _per_arm(_printed_rows, seeds[:2 if quick else 8], jobs)
-    free = _per_arm(_free_rows, seeds[:2 if quick else 12], jobs) + _simulated_rows(robot, seed, quick)
+    printed = _per_arm(_printed_rows, seeds[:1 if quick else 3], jobs)
+    free = _per_arm(_free_rows, seeds[:1 if quick else 6], jobs) + _simulated_rows(robot, seed, quick)
     faults = fault_rows(robot, seed)
     tables = {"grooves": _summary(grooves, ("groove", "pipeline", "curve")),
               "printed": _summary(printed, ("plane", "groove", "mended", "curve")),
@@ -68,7 +77,7 @@ def _groove_rows(seed: int) -> list[Row]:
     for groove, curvature in GROOVES.items():
         strain = bent(robot, curvature, np.radians(PLANES["roll"]))
         truth = arm.backbone(strain, SPAN * FRACTIONS)
-        samples = arm.record(groove_motion(arm, strain))
+        samples = arm.record(_motion(arm, strain))
         for pipeline, estimator in _pipelines(robot, calibration).items():
             points, tangents = _last(estimator, samples)
             rows += [_row(curves.fit_curve(points, tangents, method), truth, groove=groove, pipeline=pipeline,
@@ -98,7 +107,7 @@ def _printed_rows(seed: int) -> list[Row]:
         for groove, curvature in GROOVES.items():
             strain = bent(robot, curvature, np.radians(azimuth))
             truth = arm.backbone(strain, SPAN * FRACTIONS)
-            samples = arm.record(groove_motion(arm, strain))
+            samples = arm.record(_motion(arm, strain))
             for count in range(len(MENDS) + 1):
                 names = list(MENDS)[:count]
                 estimate = paper_pipeline(robot, samples, background, names)
@@ -120,7 +129,7 @@ def _free_rows(seed: int) -> list[Row]:
     rows = []
     for shape, strain in shapes.items():
         truth = arm.backbone(strain, SPAN * FRACTIONS)
-        points, tangents = _last(ShapeEstimator(robot, calibration=calibration), arm.record(groove_motion(arm, strain)))
+        points, tangents = _last(ShapeEstimator(robot, calibration=calibration), arm.record(_motion(arm, strain)))
         rows += _both_forms(points, tangents, truth, shape=shape, seed=seed)
     return rows
 
@@ -149,6 +158,10 @@ def _simulated_rows(robot: RobotDescription, seed: int, quick: bool) -> list[Row
 
 
 # Shared parts
+
+
+def _motion(arm: Arm, strain: np.ndarray) -> Motion:
+    return groove_motion(arm, strain, rest=1.2, travel=1.5, hold=1.5)
 
 
 def _per_arm(experiment: Callable[[int], list[Row]], seeds: Sequence[int], jobs: int) -> list[Row]:
@@ -209,7 +222,7 @@ def figure_data(robot: RobotDescription, seed: int) -> dict[str, dict[str, Any]]
     data = {}
     for groove, curvature in GROOVES.items():
         strain = bent(robot, curvature, np.radians(PLANES["roll"]))
-        samples = arm.record(groove_motion(arm, strain))
+        samples = arm.record(_motion(arm, strain))
         points, tangents = _last(ShapeEstimator(robot, calibration=calibration), samples)
         printed: PaperEstimate = paper_pipeline(robot, samples, background)
         mended = paper_pipeline(robot, samples, background, MENDS.keys() - {"ring"})
