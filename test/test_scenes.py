@@ -242,6 +242,13 @@ def test_file_that_is_no_mesh_is_refused_by_name(tmp_path, content, suffix):
         load_scene(path)
 
 
+def test_cloud_of_points_is_no_scene(tmp_path):
+    path = tmp_path / "points.ply"
+    trimesh.PointCloud(CUBE.vertices).export(path)
+    with pytest.raises(SceneError, match="no faces; export a triangle mesh"):
+        load_scene(path)
+
+
 def test_absent_file_is_refused(tmp_path):
     with pytest.raises(SceneError, match="no such file"):
         load_scene(tmp_path / "absent.stl")

@@ -240,6 +240,11 @@ def test_unknown_fidelity_is_refused():
         sensor(wall(1.0), "perfect")
 
 
+def test_settings_of_the_real_sensor_are_refused_where_they_would_do_nothing():
+    with pytest.raises(ValueError, match="takes no settings"):
+        TofSensorModel(MODEL, RayCaster(wall(1.0)), "paper", np.random.default_rng(0), IDEAL)
+
+
 # Fidelity `vl53l5cx`.
 
 

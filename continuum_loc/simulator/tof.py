@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from continuum_loc.robot import TofModel
 from continuum_loc.simulator.raycast import RayCaster, cast_capsules
 
 TOF_TOO_CLOSE = 4  # the driver reports a consistency failure there
+
+if TYPE_CHECKING:
+    from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
 
 Fidelity = Literal["paper", "vl53l5cx"]
 
@@ -51,11 +54,15 @@ class Receiver(Protocol):
 
 
 class TofSensorModel:
-    """All ToF sensors of one robot. The same generator state and poses give the same frames."""
+    """All ToF sensors of one robot. The same generator state and poses give the same frames.
 
-    def __init__(self, tof_model: TofModel, caster: RayCaster, fidelity: Fidelity, rng: np.random.Generator) -> None:
+    settings: how a VL53L5CX departs from ideal (fidelity `vl53l5cx` alone; None takes the usual ones).
+    """
+
+    def __init__(self, tof_model: TofModel, caster: RayCaster, fidelity: Fidelity, rng: np.random.Generator,
+                 settings: Vl53l5cxSettings | None = None) -> None:
         self._zones, self._caster, self._rng = tof_model.directions, caster, rng
-        self._receiver = _receiver(tof_model, fidelity)
+        self._receiver = _receiver(tof_model, fidelity, settings)
 
     def measure(self, T_map_sensors: np.ndarray, names: Sequence[str], stamp: int,
                 body_capsules: np.ndarray | None = None) -> list[TofFrame]:
@@ -110,11 +117,13 @@ class PaperReceiver:
         return Readings(ranges, sigma, status)
 
 
-def _receiver(tof_model: TofModel, fidelity: str) -> Receiver:
-    if fidelity == "paper":
+def _receiver(tof_model: TofModel, fidelity: str, settings: Vl53l5cxSettings | None) -> Receiver:
+    if fidelity == "paper" and settings is None:
         return PaperReceiver(tof_model)
     if fidelity == "vl53l5cx":
         from continuum_loc.simulator.vl53l5cx import Vl53l5cxReceiver
 
-        return Vl53l5cxReceiver(tof_model)
+        return Vl53l5cxReceiver(tof_model, settings)
+    if fidelity == "paper":
+        raise ValueError("ToF fidelity 'paper' takes no settings of a VL53L5CX")
     raise ValueError(f"no ToF fidelity '{fidelity}': give {' or '.join(get_args(Fidelity))}")
