@@ -145,9 +145,10 @@ def scene_figure(around: Surroundings, shown: list[Moment], epoch: int) -> go.Fi
     still = _still_traces(around)
     frames = [go.Frame(name=str(index), data=_moving_traces(moment),
                        traces=list(range(len(still), len(still) + 4))) for index, moment in enumerate(shown)]
-    figure = go.Figure(data=still + (_moving_traces(shown[0]) if shown else []), frames=frames)
+    first = len(shown) // 2  # the middle shows more than the start, where no points have been gathered yet
+    figure = go.Figure(data=still + (_moving_traces(shown[first]) if shown else []), frames=frames)
     if shown:
-        figure.update_layout(sliders=[_slider(shown, epoch)], updatemenus=[_play_buttons()])
+        figure.update_layout(sliders=[{**_slider(shown, epoch), "active": first}], updatemenus=[_play_buttons()])
     hidden = {"showgrid": False, "zeroline": False, "showbackground": False, "title": "", "showticklabels": False,
               "showspikes": False, "visible": False}
     figure.update_layout(
@@ -216,7 +217,7 @@ def _slider(shown: list[Moment], epoch: int) -> dict:
     steps = [{"label": f"{(moment.stamp - epoch) / NANOSECONDS:.1f}", "method": "animate",
               "args": [[str(index)], {**ANIMATION, "frame": {"duration": 0, "redraw": True}}]}
              for index, moment in enumerate(shown)]
-    return {"steps": steps, "active": 0, "x": 0.16, "len": 0.82, "y": 0.04, "yanchor": "bottom",
+    return {"steps": steps, "x": 0.16, "len": 0.82, "y": 0.04, "yanchor": "bottom",
             "pad": {"t": 0, "b": 0}, "ticklen": 0, "font": {"color": "rgba(0,0,0,0)", "size": 1},
             "currentvalue": {"prefix": "t = ", "suffix": " s", "font": {"size": 13, "color": INK}, "xanchor": "left"},
             "bordercolor": "#c3cbd5", "bgcolor": "#eef1f5"}

@@ -8,6 +8,7 @@ from continuum_loc.evaluation.campaign import Outcome, run_campaign
 from continuum_loc.evaluation.error_tables import condition_table, mean, trial_rows
 from continuum_loc.evaluation.split import HOLD_OUT, is_hold_out, require_unseen
 from continuum_loc.evaluation.study import Claim, at_most, write_study
+from continuum_loc.evaluation.study_report import write_study_report
 from continuum_loc.evaluation.trials import Trial
 
 SCENES = tuple(f"S{number}" for number in range(10))
@@ -30,6 +31,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     write_study(out, claims, seed=seed, settings={"trials": [outcome.trial for outcome in outcomes]}, tables=tables,
                 extra={"quick": quick, "hold_out": HOLD_OUT["engine"],
                        "failed": {outcome.trial.name: outcome.error for outcome in outcomes if outcome.error}})
+    write_study_report(out, "Table II: the engine", claims, {"Errors by scene": tables["table2"]}, outcomes)
     return claims
 
 

@@ -9,6 +9,7 @@ from continuum_loc.evaluation.error_tables import condition_table, mean, trial_r
 from continuum_loc.evaluation.split import HOLD_OUT, is_hold_out, require_unseen
 from continuum_loc.evaluation.studies._soft_arm import ADDED, FIDELITIES, MATCHING, REMOVED, pair, soft_arm_trials
 from continuum_loc.evaluation.study import Claim, at_most, write_study
+from continuum_loc.evaluation.study_report import write_study_report
 from continuum_loc.evaluation.trials import GYRO_BIAS, MOUNTING_ERROR, TOF_CLOCK_OFFSET
 
 PAPER = {
@@ -41,6 +42,8 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
                           "gyro_bias": GYRO_BIAS, "tof_clock_offset": TOF_CLOCK_OFFSET},
                 extra={"quick": quick, "hold_out": HOLD_OUT["soft_arm"],
                        "failed": {outcome.trial.name: outcome.error for outcome in outcomes if outcome.error}})
+    write_study_report(out, "Table III: the soft arm", claims,
+                       {f"Errors, sensors `{name}`": tables[f"table3_{name}"] for name in FIDELITIES}, outcomes)
     return claims
 
 

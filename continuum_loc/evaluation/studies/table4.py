@@ -10,6 +10,7 @@ from continuum_loc.evaluation.error_tables import figures, per_ring, trial_rows
 from continuum_loc.evaluation.studies._soft_arm import FIDELITIES, soft_arm_trials
 from continuum_loc.evaluation.studies.table3 import of_fidelity
 from continuum_loc.evaluation.study import Claim, at_most, write_study
+from continuum_loc.evaluation.study_report import write_study_report
 from continuum_loc.robot import load_robot
 
 # Ring, base to tip: translation MAE (cm) and rotation MAE (deg) of the paper.
@@ -27,6 +28,8 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     claims.append(at_most("trials that failed", sum(outcome.summary is None for outcome in outcomes), "", 0))
     write_study(out, claims, seed=seed, settings={"trials": [outcome.trial for outcome in outcomes]},
                 tables={**tables, "trials": trial_rows(outcomes)}, extra={"quick": quick})
+    write_study_report(out, "Table IV: the soft arm, ring by ring", claims,
+                       {f"Errors, sensors `{name}`": tables[f"table4_{name}"] for name in FIDELITIES}, outcomes)
     return claims
 
 
