@@ -10,7 +10,7 @@ from continuum_loc.measurements import NANOSECONDS, FieldSample, ImuSample, Stra
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import SettingsError, dump_settings, parse_settings
 from continuum_loc.shape import ShapeEstimator, ShapeSettings, curves, load_shape_settings
-from continuum_loc.shape.backbone import PIECES, BackboneSolver
+from continuum_loc.shape.backbone import PIECES, BackboneSolver, _forward
 from continuum_loc.shape.calibration import (
     Calibration,
     CalibrationError,
@@ -194,6 +194,22 @@ def test_joint_fit_bridges_a_module_that_says_nothing(arm, calibration, recordin
     assert sigma[1, :3].max() > sigma[0, :3].max()
 
 
+def test_chain_of_arcs_differentiates_on_the_right():
+    rng = np.random.default_rng(3)
+    lengths = BackboneSolver(ROBOT, S).lengths
+    strain = rng.normal(size=(len(lengths), 3)) * [0.5, 15, 15]
+    T, chain = _forward(strain, lengths)
+
+    def shifted(k, h):
+        step = np.zeros(strain.size)
+        step[k] = h
+        return _forward(strain + step.reshape(strain.shape), lengths)[0]
+
+    h = 1e-5
+    columns = [lie.log(lie.inverse(shifted(k, -h)) @ shifted(k, h)) / (2 * h) for k in range(strain.size)]
+    np.testing.assert_allclose(chain, np.stack(columns, axis=-1), atol=1e-8)
+
+
 # The estimator
 
 
@@ -291,6 +307,35 @@ def test_every_fault_is_told_for_what_it_is():
 
     wrong = [(row["fault"], row["told"]) for row in fault_rows(ROBOT, 4) if not row["right"]]
     assert not wrong
+
+
+@pytest.mark.parametrize("fault", ["silent", "frozen"])
+def test_module_that_comes_back_is_taken_up_again(arm, calibration, fault):
+    """Module 2 is lost for 1.4 s on the way into the groove; back, it knows its rotation from the backbone."""
+    strain = bent(ROBOT, 12.5, 0.6)
+    samples = arm.record(groove_motion(arm, strain))
+    begin, last, stream = samples[0].stamp, {}, []
+    for sample in samples:
+        lost = 2.3 < seconds(sample.stamp, begin) < 3.7 and sample.sensor.startswith("module2")
+        if lost and fault == "frozen":
+            stream.append(replace(last[sample.sensor], stamp=sample.stamp))
+        elif not lost:
+            stream.append(sample)
+            last[sample.sensor] = sample
+    found = estimates(ShapeEstimator(ROBOT, calibration=calibration), stream)
+    truth = true_poses(arm, strain)
+    assert any("module2" in estimate.faults for estimate in found) and not found[-1].faults
+    assert np.linalg.norm(found[-1].T_map_module[1, :3, 3] - truth[1, :3, 3]) < 4e-4
+    assert lie.rotation_error_deg(found[-1].T_map_module[1, :3, :3], truth[1, :3, :3]) < 2.0
+    assert found[-1].yaw_sigma[1] > np.radians(2.0)
+
+
+def test_euler_form_is_an_option_that_finds_a_gentle_bend(arm, calibration):
+    strain = bent(ROBOT, 12.5, np.radians(-90.0))
+    settings = ShapeSettings(attitude_filter="euler")
+    last = estimates(ShapeEstimator(ROBOT, settings, calibration), arm.record(groove_motion(arm, strain)))[-1]
+    assert np.isinf(last.yaw_sigma).all(), "it states no uncertainty of its yaw"
+    assert np.linalg.norm(last.T_map_module[:, :3, 3] - true_poses(arm, strain)[:, :3, 3], axis=1).max() < 2e-3
 
 
 def test_reset_tares_again(calibration, recording):

@@ -12,7 +12,7 @@ Both read samples in the IMU's own frame; `map` has z up, and a resting accelero
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -145,6 +145,21 @@ class EulerFilter:
     yaw_as_printed: bool = False
     angles: np.ndarray | None = None
     stamp: int = 0
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # Eqs. 3-6 state no uncertainty. What `ShapeEstimator` reads of a filter is then: always moving, a degree of
+    # error, and a yaw that nobody knows.
+    rate: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
+    covariance: np.ndarray = field(default_factory=lambda: np.radians(1.0) ** 2 * np.eye(3))
+    yaw_sigma: float = math.inf
+
+    def start(self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0) -> None:
+        """Begin at a known rotation with a gyro bias (3,) [rad/s], instead of at the first sample with yaw 0."""
+        self.stamp, self.bias = stamp, np.array(bias, dtype=float)
+        self.angles = Rotation.from_matrix(R_map_imu).as_euler("ZYX")[::-1].copy()
+
+    def rotation_at(self, stamp: int) -> np.ndarray:
+        """The rotation of the last sample."""
+        return self.R_map_imu
 
     def update(self, stamp: int, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
         """Blend one sample, gyro (3,) [rad/s] and accel (3,) [m/s^2]; returns R_map_imu (3, 3)."""
@@ -152,7 +167,7 @@ class EulerFilter:
         if self.angles is None:
             self.angles = np.array([roll, pitch, 0.0])
         else:
-            carried = self.angles + euler_rates(self.angles, gyro) * seconds(stamp, self.stamp)
+            carried = self.angles + euler_rates(self.angles, gyro - self.bias) * seconds(stamp, self.stamp)
             measured = np.array([roll, pitch, 0.0 if self.yaw_as_printed else carried[2]])
             # Angles blend along the shorter way round.
             difference = (measured - carried + math.pi) % (2.0 * math.pi) - math.pi

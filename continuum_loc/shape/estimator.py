@@ -39,9 +39,8 @@ from continuum_loc.shape.magnet import FieldModel
 from continuum_loc.shape.position import PositionSolver
 from continuum_loc.shape.rest import MotionError, Rest, RestWindow
 
-MOVING = np.full(3, np.inf)
 STALE = 2.5  # sample periods: older readings do not belong to one time
-EULER_SIGMA = np.radians(1.0)  # the paper's filter states no uncertainty
+RESUMED_YAW = np.radians(3.0)  # rad, 1 sigma
 Status = Literal["taring", "tracking", "degraded", "faulty"]
 
 
@@ -129,6 +128,7 @@ class _Module:
     hall: _Stream = field(default_factory=_Stream)
     field_base: np.ndarray | None = None  # total field in the base frame [T], averaged while the module rests
     averaged: int = 0
+    lost: bool = False  # the IMU was silent or frozen: its attitude is stale until it starts again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +183,7 @@ class ShapeEstimator:
         self._window_end: int | None = None
         self._next_due: int | None = None
         self._next_watch: int | None = None
-        self._prior = straight_modules(self.robot)[:, :3, 3]
+        self._prior = straight_modules(self.robot)
         self._consistency = np.nan
         self._wiring: dict[str, str] = {}
         self._modules = [_Module(ring, self._new_filter()) for ring in self.module_names]
@@ -253,12 +253,8 @@ class ShapeEstimator:
         yaw_sigma = 0.0 if self.settings.start == "straight" else np.radians(10.0)
         for m, module in enumerate(self._modules):
             accel = rest.accel[m] - self._accel_offset[m]
-            if isinstance(module.filter, GravityFilter):
-                R_map_imu = level(self.T_map_base[:3, :3] @ self._R_module_imu[m], accel)
-                module.filter.start(stamp, R_map_imu, rest.gyro[m], yaw_sigma)
-            else:
-                module.filter.update(stamp, np.zeros(3), accel)
-                module.filter.bias = rest.gyro[m]
+            R_map_imu = level(self.T_map_base[:3, :3] @ self._R_module_imu[m], accel)
+            module.filter.start(stamp, R_map_imu, rest.gyro[m], yaw_sigma)
             if np.isfinite(rest.field[m]).all():
                 R_base_hall = self._R_base_module(m, stamp) @ self._R_module_hall[m]
                 module.field_base, module.averaged = R_base_hall @ (rest.field[m] - self._hall_offset[m]), rest.samples
@@ -284,18 +280,25 @@ class ShapeEstimator:
     def _turn(self, module: _Module, sample: ImuSample) -> None:
         m = self._index[sample.sensor]
         accel = sample.linear_acceleration - self._accel_offset[m]
-        if isinstance(module.filter, GravityFilter):
-            module.filter.update(sample.stamp, sample.angular_velocity, accel)
-        else:
-            module.filter.update(sample.stamp, sample.angular_velocity - module.filter.bias, accel)
+        if module.lost:
+            if module.imu.repeats > 1:
+                return
+            self._resume(module, m, sample.stamp, accel)
+        module.filter.update(sample.stamp, sample.angular_velocity, accel)
+
+    def _resume(self, module: _Module, m: int, stamp: int, accel: np.ndarray) -> None:
+        """An IMU that comes back starts at the backbone's rotation there, which the others have kept."""
+        module.lost = False
+        R_map_imu = level(self.T_map_base[:3, :3] @ self._prior[m, :3, :3] @ self._R_module_imu[m], accel)
+        module.filter.start(stamp, R_map_imu, module.filter.bias, RESUMED_YAW)
 
     def _sense(self, module: _Module, sample: FieldSample) -> None:
         """Smooth the field in the base frame, where it stands still as long as the module does."""
         m = self._index[sample.sensor]
         R_base_hall = self._R_base_module(m, sample.stamp) @ self._R_module_hall[m]
         field_base = R_base_hall @ (sample.field - self._hall_offset[m])
-        rate = module.filter.rate if isinstance(module.filter, GravityFilter) else MOVING
-        if module.field_base is None or rate @ rate > self.settings.still**2:
+        rate = module.filter.rate
+        if module.averaged == 0 or rate @ rate > self.settings.still**2:
             module.field_base, module.averaged = field_base, 1
         else:
             # The mean of what came since the module rests, then a mean that forgets.
@@ -304,8 +307,7 @@ class ShapeEstimator:
             module.field_base = module.field_base + gain * (field_base - module.field_base)
 
     def _R_base_module(self, m: int, stamp: int) -> np.ndarray:
-        attitude = self._modules[m].filter
-        R_map_imu = attitude.rotation_at(stamp) if isinstance(attitude, GravityFilter) else attitude.R_map_imu
+        R_map_imu = self._modules[m].filter.rotation_at(stamp)
         return self.T_map_base[:3, :3].T @ R_map_imu @ self._R_module_imu[m].T
 
     # Estimates
@@ -330,7 +332,7 @@ class ShapeEstimator:
             self._watch(now, joint)
         solution = self._by_module(now, joint) if not jointly else _Solution(
             joint.T_base_module, joint.covariance, np.zeros((len(now.good), 3), int), now.good)
-        self._prior = solution.T_base_module[:, :3, 3]
+        self._prior = solution.T_base_module
         return self._describe(stamp, solution)
 
     def _snapshot(self, stamp: int) -> _Snapshot:
@@ -357,14 +359,14 @@ class ShapeEstimator:
                 texts.append("hall has not reported yet")
             if texts:
                 found[module.name] = tuple(texts)
+                module.averaged = 0  # what comes after is another average
+            module.lost |= any(text in ("imu silent", "imu frozen") for text in texts)
         return found
 
     def _attitude_covariance(self, R_base_map: np.ndarray) -> np.ndarray:
         """(M, 3, 3) of the modules' rotations in base axes, mounting included [rad^2]."""
         mounting = self.calibration.mounting_sigma**2 * np.eye(3)
-        filters = [module.filter for module in self._modules]
-        own = [f.covariance if isinstance(f, GravityFilter) else EULER_SIGMA**2 * np.eye(3) for f in filters]
-        return R_base_map @ np.stack(own) @ R_base_map.T + mounting
+        return R_base_map @ np.stack([module.filter.covariance for module in self._modules]) @ R_base_map.T + mounting
 
     def _joint(self, now: _Snapshot, order: tuple[int, ...] | None = None, sign: float = 1.0) -> BackboneFit:
         """The joint fit; `order` and `sign` try another wiring or a reversed magnet."""
@@ -381,7 +383,7 @@ class ShapeEstimator:
     def _by_module(self, now: _Snapshot, joint: BackboneFit | None) -> _Solution:
         """Eq. 10 for the good modules, the joint fit's pose for the others."""
         offset = np.array([self.robot.magnet.s, 0.0, 0.0])
-        source, prior = now.field_base - now.earth, self._prior - offset
+        source, prior = now.field_base - now.earth, self._prior[:, :3, 3] - offset
         if joint is not None:
             prior = joint.T_base_module[:, :3, 3] - offset
             # A module left out solves for the field of its own prior, which changes nothing.
@@ -427,7 +429,7 @@ class ShapeEstimator:
         self.message = "; ".join(f"{name}: {', '.join(texts)}" for name, texts in self.faults.items())
         curve = self._curve(solution.T_base_module)
         R, p = self.T_map_base[:3, :3], self.T_map_base[:3, 3]
-        yaw = [m.filter.yaw_sigma if isinstance(m.filter, GravityFilter) else np.inf for m in self._modules]
+        yaw = [module.filter.yaw_sigma for module in self._modules]
         return ShapeEstimate(stamp, self.module_names, self.T_map_base @ solution.T_base_module, solution.covariance,
                              curve @ R.T + p, arclength(curve) + self.robot.magnet.s, solution.observable,
                              solution.bound, np.array(yaw), self.status, dict(self.faults), self._consistency)
