@@ -211,29 +211,50 @@ def report(run: Annotated[Path, typer.Argument(help="run folder")] = Path("runs/
 
 
 @app.command()
-def evaluate(name: Annotated[str | None, typer.Argument(help="study; without one they are listed")] = None,
+def evaluate(name: Annotated[str | None, typer.Argument(help="study; without one they are listed; `bags` for "
+                                                        "recordings of your own")] = None,
+             folder: Annotated[Path | None, typer.Argument(help="with `bags`: the folder that holds them")] = None,
              quick: Annotated[bool, typer.Option("--quick", help="a small honest subset, under a minute")] = False,
              out: Annotated[Path | None, typer.Option(help="folder of the results; default: a new run")] = None,
-             seed: Seed = 0, jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1) -> None:
+             seed: Seed = 0, jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
+             scheduler: Annotated[str, typer.Option(help="address of a Dask scheduler to run the trials on")] = "",
+             robot: Annotated[str, typer.Option(help="with `bags`: the robot")] = "engine",
+             map_file: Annotated[Path | None, typer.Option("--map", help="with `bags`: the prior map")] = None,
+             settings: Settings = None) -> None:
     """Run a study and compare its figures with their bounds; the exit code is 1 where one does not hold.
 
     An interrupted study continues where it stopped when its `--out` is given again.
 
-    Example: `continuum-loc evaluate table2 --quick --jobs 2`
+    Example: `continuum-loc evaluate table2 --quick --jobs 2`, `continuum-loc evaluate bags my_bags --map my_map.npz`
     """
+    from continuum_loc.evaluation.campaign import SCHEDULER
     from continuum_loc.evaluation.runs import new_run
     from continuum_loc.evaluation.study import load_study, study_names
 
     if name is None:
-        console.print("studies: " + ", ".join(study_names()))
+        console.print("studies: " + ", ".join([*study_names(), "bags DIR"]))
         return
-    run = load_study(name)
+    if name == "bags" and (folder is None or map_file is None):
+        raise typer.BadParameter("bags needs a folder and a map: evaluate bags DIR --map FILE")
+    run = None if name == "bags" else load_study(name)
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
-    claims = run(out, quick, seed, jobs)
+    SCHEDULER.set(scheduler)
+    claims = run(out, quick, seed, jobs) if run else _evaluate_bags(folder, robot, map_file, settings, out, jobs)
     console.print(_claims_table(claims))
     console.print(f"results {out}")
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _evaluate_bags(folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path,
+                   jobs: int) -> list[Claim]:
+    from continuum_loc.estimator.settings import load_estimator_settings
+    from continuum_loc.evaluation.bags import evaluate_bags
+    from continuum_loc.robot import load_robot
+
+    description = load_robot(robot)
+    return evaluate_bags(folder, description, map_file, load_estimator_settings(settings or description.name), out,
+                         jobs)
 
 
 @app.command()

@@ -13,6 +13,7 @@ import shutil
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,14 +24,21 @@ from continuum_loc.evaluation.trials import Trial
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
 
+# Address of a Dask scheduler that runs the work instead of processes of our own; none by default.
+SCHEDULER: ContextVar[str] = ContextVar("scheduler", default="")
+
 Progress = Callable[[Iterator[Any], int, str], Iterator[Any]]
+
+
+class CampaignError(ValueError):
+    """A campaign that cannot be run where it was asked to."""
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What became of a trial: its summary, or the error (last line of a traceback) that ended it."""
 
-    trial: Trial
+    trial: Any  # a Trial, or a recorded one: what it must have is a `name`
     summary: dict[str, Any] | None
     error: str = ""
 
@@ -41,7 +49,7 @@ def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: Es
 
     The number of jobs changes nothing but the time: each trial is seeded and runs in one process by itself.
     """
-    progress = progress or _bar
+    progress = progress or show_progress
     bags = {trial.recording: trial for trial in trials if not _bag(out, trial).is_dir()}
     failed = {}
     for done in progress(parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
@@ -55,6 +63,9 @@ def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: Es
 
 def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]:
     """Results of `work(*arguments)` as they come. A worker that dies ends the campaign; what is done stays done."""
+    if SCHEDULER.get():
+        yield from _distributed(work, arguments, SCHEDULER.get())
+        return
     if jobs == 1:
         yield from (work(*each) for each in arguments)
         return
@@ -63,6 +74,25 @@ def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]
     # Fresh interpreters: forked ones would share the state of numeric libraries' threads.
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_one_thread) as pool:
         for future in as_completed([pool.submit(work, *each) for each in arguments]):
+            yield future.result()
+
+
+def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterator[Any]:
+    """The same on the workers of a Dask cluster, which must see the same files under the same names."""
+    try:
+        from distributed import Client
+        from distributed import as_completed as as_distributed
+    except ImportError:
+        raise CampaignError("a scheduler needs Dask: pip install distributed") from None
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise CampaignError(f"no Dask scheduler at {address} ({error or type(error).__name__})") from None
+    with client:
+        client.run(_one_thread)
+        # The work is seeded, so a cached result would be right; but files are part of it, so nothing is reused.
+        futures = [client.submit(work, *each, pure=False) for each in arguments]
+        for future in as_distributed(futures):
             yield future.result()
 
 
@@ -122,7 +152,8 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
                                    extra={"configuration_digest": key}))
 
 
-def _bar(results: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+def show_progress(results: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+    """Pass results on, with a bar and the time left, on the terminal's error stream."""
     from rich.console import Console
     from rich.progress import track
 
