@@ -42,8 +42,8 @@ def test_left_jacobian_is_the_derivative_of_exp(angle):
     xi, d = twists(angle), 1e-6 * np.random.default_rng(1).normal(size=(6, 6))
     moved = lie.log(lie.exp(xi + d) @ lie.inverse(lie.exp(xi - d))) / 2.0
     np.testing.assert_allclose((lie.left_jacobian(xi) @ d[..., None])[..., 0], moved, atol=1e-14)
-    np.testing.assert_allclose(lie.left_jacobian(xi) @ lie.left_jacobian_inverse(xi), np.broadcast_to(np.eye(6), (6, 6, 6)),
-                               atol=1e-12)
+    identity = np.broadcast_to(np.eye(6), (6, 6, 6))
+    np.testing.assert_allclose(lie.left_jacobian(xi) @ lie.left_jacobian_inverse(xi), identity, atol=1e-12)
 
 
 @settings(max_examples=60, deadline=None)

@@ -28,6 +28,7 @@ from continuum_loc.measurements import ImuSample, Measurement, TofFrame, seconds
 from continuum_loc.robot import RobotDescription
 
 TIME_EPSILON = 1e-9  # stamps are integer nanoseconds
+PATIENCE = 1.5  # ToF periods that a cycle waits for silent sensors
 DAMPING_LIMIT = 1e4
 REST_TURN = 0.005  # [rad] a body that turned farther during the initial rest was not at rest
 REST_SIGMA = 0.002  # [rad/s] how well rest is rest
@@ -131,18 +132,16 @@ class SlidingWindowFilter:
         """Whether a cycle that began can wait no longer for the sensors that are missing in it."""
         if self._cycle_start is None or measurement.stamp <= self._cycle_start:
             return False
-        rate = self.robot.tof_model.rate if self.tof is not None else self.settings.output_rate
+        period = 1.0 / self.settings.output_rate if self.tof is None else PATIENCE / self.robot.tof_model.rate
         again = isinstance(measurement, TofFrame) and measurement.sensor in self._cycle
-        return again or seconds(measurement.stamp, self._cycle_start) >= 1.0 / rate - TIME_EPSILON
+        return again or seconds(measurement.stamp, self._cycle_start) >= period - TIME_EPSILON
 
     def _cycle_complete(self, measurement: Measurement) -> bool:
-        """Note the measurement in the running cycle; True when every sensor of the last cycle has spoken."""
-        if self.tof is None:
-            self._cycle_start = self._cycle_start or measurement.stamp
+        """Note the measurement in the running cycle; True when every ToF sensor of the last cycle has spoken."""
+        self._cycle_start = self._cycle_start or measurement.stamp
+        if self.tof is None or not isinstance(measurement, TofFrame):
             return False
-        if isinstance(measurement, TofFrame):
-            self._cycle_start = self._cycle_start or measurement.stamp
-            self._cycle.add(measurement.sensor)
+        self._cycle.add(measurement.sensor)
         return bool(self._last_cycle) and self._cycle >= self._last_cycle or len(self._cycle) == len(self.robot.tof)
 
     # ------------------------------------------------------------------ the window

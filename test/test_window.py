@@ -1,0 +1,168 @@
+"""The filter as a whole in an analytic world: accuracy, honesty, late and bad data, being lost and found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import EPOCH, Rod, rod, room_map, stream
+
+from continuum_loc import lie
+from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
+from continuum_loc.measurements import ImuSample, TofFrame, TruthSample
+from continuum_loc.settings import parse_settings
+
+
+@pytest.fixture(scope="module")
+def prior_map():
+    return room_map()
+
+
+def settings(**changes) -> EstimatorSettings:
+    return parse_settings(EstimatorSettings, {"knot_period": 0.1, "window": 0.6, "lag": 0.2, **changes})
+
+
+def run(filter_: SlidingWindowFilter, samples) -> tuple[list, dict]:
+    estimates, truth = [], {}
+    for sample in samples:
+        if isinstance(sample, TruthSample):
+            truth[sample.stamp] = sample.T_map_ring
+            continue
+        estimate = filter_.process(sample)
+        if estimate is not None:
+            estimates.append(estimate)
+    return estimates, truth
+
+
+def errors(estimates, truth) -> np.ndarray:
+    """(K, R + 1, 6) body-frame pose errors of the estimates that have a true pose at their stamp."""
+    return np.array([lie.log(lie.inverse(e.T_map_ring) @ truth[e.stamp]) for e in estimates if e.stamp in truth])
+
+
+def test_tracks_the_rod_within_its_own_covariance(prior_map):
+    robot = rod()
+    estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 3.0))
+    e = errors(estimates, truth)[5:, 1:]
+    assert len(estimates) == 46
+    assert np.sqrt(np.mean(e[..., :3] ** 2)) < 2e-3
+    assert np.degrees(np.sqrt(np.mean(e[..., 3:] ** 2))) < 0.3
+    P = np.array([x.covariance for x in estimates])[5:, 1:]
+    nees = np.einsum("kri,krij,krj->kr", e, np.linalg.inv(P), e) / 6.0
+    assert 0.05 < np.mean(nees) < 2.0
+    assert all(x.status == "tracking" for x in estimates[5:])
+
+
+def test_velocity_is_the_bodys(prior_map):
+    robot = rod()
+    motion = Rod(robot, seed=2)
+    estimates, _ = run(SlidingWindowFilter(robot, prior_map, settings()), stream(motion, 3.0))
+    e = np.array([x.velocity - motion.rates((x.stamp - EPOCH) / 1e9) for x in estimates[15:]])[:, 1:]
+    assert np.sqrt(np.mean(e[..., :3] ** 2)) < 0.02
+    assert np.sqrt(np.mean(e[..., 3:] ** 2)) < 0.05
+
+
+def test_the_smoothed_estimate_is_the_better_one(prior_map):
+    robot = rod()
+    estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings(lag=0.2)), stream(Rod(robot, seed=1), 3.0))
+    lagged = [x.lagged for x in estimates if x.lagged is not None]
+    lagged = [x for x in lagged if x.stamp in truth][3:]
+    assert len(lagged) > 20
+    smoothed = np.sqrt(np.mean(errors(lagged, truth)[:, 1:, :3] ** 2))
+    newest = np.sqrt(np.mean(errors(estimates[6:], truth)[:, 1:, :3] ** 2))
+    assert smoothed < newest
+
+
+def test_the_same_measurements_give_the_same_estimate(prior_map):
+    robot = rod()
+    first, second = (run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 1.5))[0]
+                     for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.T_map_ring, b.T_map_ring)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_order_within_the_window_does_not_matter_and_older_data_is_dropped_and_counted(prior_map):
+    """A gyro that reports 50 ms late is still used; a sample from before the window is not."""
+    robot = rod()
+    samples = list(stream(Rod(robot), 2.0))
+    late = [replace(s, stamp=s.stamp) for s in samples if isinstance(s, ImuSample) and s.sensor == "r1_imu"]
+    others = [s for s in samples if not (isinstance(s, ImuSample) and s.sensor == "r1_imu")]
+    mixed = sorted(others + late, key=lambda s: s.stamp + (50_000_000 if s in late else 0))
+    filter_ = SlidingWindowFilter(robot, prior_map, settings())
+    estimates, truth = run(filter_, mixed)
+    assert filter_.counts["used"]["ImuSample"] == sum(isinstance(s, ImuSample) for s in samples)
+    assert np.max(np.abs(errors(estimates, truth)[5:, 1:, :3])) < 0.01
+    filter_.process(samples[1])
+    assert filter_.counts["dropped"]["older than the window"] == 1
+
+
+def test_unusable_measurements_are_counted_and_harmless(prior_map):
+    robot = rod()
+    filter_ = SlidingWindowFilter(robot, prior_map, settings())
+    samples = list(stream(Rod(robot), 1.0))
+    frame = next(s for s in samples if isinstance(s, TofFrame))
+    imu = next(s for s in samples if isinstance(s, ImuSample))
+    bad = [replace(frame, sensor="nobody"), replace(frame, points=frame.points[:10]),
+           replace(imu, angular_velocity=np.array([np.nan, 0.0, 0.0])),
+           replace(imu, angular_velocity=np.array([50.0, 0.0, 0.0]))]
+    for sample in bad:
+        assert filter_.process(sample) is None
+    estimates, truth = run(filter_, samples)
+    assert dict(filter_.counts["dropped"]) == {"tof: unknown frame": 1, "tof: wrong size": 1, "gyro: not finite": 1,
+                                               "gyro: saturated": 1}
+    assert np.max(np.abs(errors(estimates, truth)[:, 1:, :3])) < 0.01
+
+
+def test_invalid_zones_carry_no_information(prior_map):
+    robot = rod()
+    nothing = [replace(s, status=np.full(64, 255, np.uint8)) if isinstance(s, TofFrame) else s
+               for s in stream(Rod(robot), 1.0)]
+    with_zones, _ = run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 1.0))
+    without, _ = run(SlidingWindowFilter(robot, prior_map, settings()), nothing)
+    assert without[-1].covariance[2, 0, 0] > 4.0 * with_zones[-1].covariance[2, 0, 0]
+
+
+def test_a_gap_is_bridged_with_growing_covariance(prior_map):
+    """Half a second with gyros alone: the covariance grows, the error stays inside it, and both shrink again."""
+    robot = rod()
+    samples = [s for s in stream(Rod(robot), 3.0)
+               if isinstance(s, ImuSample | TruthSample) or not 1.0 < (s.stamp - EPOCH) / 1e9 < 1.5]
+    estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), samples)
+    times = np.array([(e.stamp - EPOCH) / 1e9 for e in estimates])
+    spread = np.array([np.sqrt(np.trace(e.covariance[2, :3, :3])) for e in estimates])
+    before, during, after = (spread[(times > a) & (times < b)] for a, b in ((0.6, 1.0), (1.3, 1.5), (2.0, 3.0)))
+    assert np.max(during) > 3.0 * np.max(before)
+    assert np.median(after) < 1.5 * np.median(before)
+    assert np.max(np.abs(errors(estimates, truth)[-10:, 1:, :3])) < 0.01
+
+
+def test_gyro_bias_is_found_at_rest(prior_map):
+    """Within four sigmas of the rest's mean (0.01 rad/s over 50 samples, and 0.002 rad/s for rest not being rest)."""
+    robot = rod()
+    bias = {"r1_imu": np.array([0.05, -0.06, 0.04]), "r2_imu": np.array([-0.05, 0.06, 0.045])}
+    biased = [replace(s, angular_velocity=s.angular_velocity + bias[s.sensor]) if isinstance(s, ImuSample) else s
+              for s in stream(Rod(robot), 2.0)]
+    filter_ = SlidingWindowFilter(robot, prior_map, settings(gyro={"bias_sigma": 0.1}))
+    run(filter_, biased)
+    estimate = filter_.columns[-1].retract(filter_.offsets[-1]).bias
+    np.testing.assert_allclose(estimate, np.array(list(bias.values())), atol=4.0 * np.hypot(0.01 / np.sqrt(50), 0.002))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_finds_itself_from_the_base_alone(prior_map, seed):
+    """Without strain and bent from the first moment: the search along the body must find the shape."""
+    robot = rod(strain=False)
+    motion = Rod(robot, seed=seed, amplitude=1.8)
+    filter_ = SlidingWindowFilter(robot, prior_map, settings(recovery={"max_curvature": 2.0}))
+    estimates, truth = run(filter_, stream(motion, 1.0, start=2.0))
+    assert np.max(np.abs(errors(estimates, truth)[-5:, 1:, :3])) < 0.01
+
+
+def test_memory_is_bounded(prior_map):
+    robot = rod()
+    filter_ = SlidingWindowFilter(robot, prior_map, settings())
+    sizes = []
+    for sample in stream(Rod(robot), 3.0):
+        if not isinstance(sample, TruthSample) and filter_.process(sample):
+            sizes.append(len(filter_.columns))
+    assert max(sizes[10:]) - min(sizes[10:]) <= 1
+    assert max(sizes) <= 9
