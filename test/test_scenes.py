@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from continuum_loc.robot import load_robot
-from continuum_loc.simulator import scene_cache
+from continuum_loc.simulator import convex, mesh_import, scene_cache
 from continuum_loc.simulator.mesh_import import check_mesh
 from continuum_loc.simulator.raycast import RayCaster
 from continuum_loc.simulator.scenes import Anomaly, Scene, SceneError, load_scene
@@ -225,12 +225,34 @@ def test_no_cache_folder_costs_time_only(tmp_path, monkeypatch):
 
 def test_own_mesh_becomes_a_scene_with_contact_pieces(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    for suffix in ("stl", "obj", "ply"):
-        CUBE.export(tmp_path / f"cube.{suffix}")
-        scene = load_scene(tmp_path / f"cube.{suffix}")
-        assert as_trimesh(scene).volume == pytest.approx(1.0)
-        assert len(scene.hulls) == 1
-        np.testing.assert_allclose(np.abs(scene.hulls[0]), 0.5, atol=0.02)
+    CUBE.export(tmp_path / "cube.stl")
+    scene = load_scene(tmp_path / "cube.stl")
+    assert len(scene.hulls) == 1
+    np.testing.assert_allclose(np.abs(scene.hulls[0]), 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_every_format_keeps_the_geometry(tmp_path, monkeypatch, suffix):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(mesh_import, "convex_pieces", lambda *_: ())
+    CUBE.export(tmp_path / f"cube.{suffix}")
+    mesh = as_trimesh(load_scene(tmp_path / f"cube.{suffix}"))
+    assert len(mesh.vertices) == 8 and mesh.is_watertight
+    assert mesh.volume == pytest.approx(1.0)
+
+
+def test_room_given_by_its_inner_surface_gets_walls_outside_it():
+    vertices, faces = mesh_import.with_walls(CUBE.vertices, CUBE.faces[:, ::-1])
+    walls = RayCaster(scene_of_mesh(vertices, faces))
+    assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(1.1**3 - 1.0)
+    points = np.random.default_rng(0).uniform(-0.55, 0.55, (2000, 3))
+    np.testing.assert_array_equal(walls.clearance(points) > 0.0, np.abs(points).max(axis=1) < 0.5)
+
+
+def test_mesh_that_cannot_be_decomposed_is_refused_and_does_not_end_the_process(monkeypatch):
+    monkeypatch.setattr(convex, "_MODULE", "continuum_loc.no_such_module")
+    with pytest.raises(SceneError, match=r"part\.stl: cannot be split into convex pieces"):
+        convex.convex_pieces(CUBE.vertices, CUBE.faces, "part.stl")
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\nfoo", b"solid x\nendsolid x\n"])

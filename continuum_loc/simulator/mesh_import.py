@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from continuum_loc.simulator import convex
+from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene_cache import cached_scene
 from continuum_loc.simulator.scenes import Scene, SceneError
 
@@ -22,7 +24,8 @@ def import_mesh(path: Path) -> Scene:
     """
     mesh = _load(path)
     check_mesh(mesh.vertices, mesh.faces, str(path))
-    return cached_scene(path.stem, [path, Path(__file__)], lambda: _scene(path.stem, mesh.vertices, mesh.faces))
+    made_from = [path, Path(__file__), Path(convex.__file__)]
+    return cached_scene(path.stem, made_from, lambda: _scene(path, mesh.vertices, mesh.faces))
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
@@ -88,31 +91,25 @@ def _check_closed(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
                          "the orientation consistent (MeshLab: Re-Orient All Faces Coherently)")
 
 
-def _scene(name: str, vertices: np.ndarray, faces: np.ndarray) -> Scene:
+def _scene(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Scene:
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.array(faces, dtype=np.int32)
-    zeros = np.zeros(len(faces), dtype=np.int32)
-    reflectance = np.full(len(faces), _REFLECTANCE)
-    return Scene(name, vertices, faces, zeros, (name,), reflectance, _convex_pieces(vertices, faces))
+    hulls = convex_pieces(*with_walls(vertices, faces), str(path))
+    owner = np.zeros(len(faces), dtype=np.int32)
+    return Scene(path.stem, vertices, faces, owner, (path.stem,), np.full(len(faces), _REFLECTANCE), hulls)
 
 
-def _convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Convex decomposition by CoACD; a room's inner surface is given walls first.
-
-    CoACD's preprocessing stays on: without it thin blades crash it.
-    """
-    import coacd
+def with_walls(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A solid as it is; the inner surface of a room as the walls round it."""
+    if _volume(vertices, faces) > 0.0:
+        return vertices, faces
     from manifold3d import Manifold
 
     from continuum_loc.simulator.solids import mesh_of, solid_of
 
-    if _volume(vertices, faces) < 0.0:
-        low, high = vertices.min(axis=0) - _WALL, vertices.max(axis=0) + _WALL
-        block = Manifold.cube(tuple(high - low)).translate(tuple(low))
-        vertices, faces = mesh_of(block - solid_of(vertices, faces[:, ::-1]))
-    coacd.set_log_level("error")
-    pieces = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=0.02, seed=0)
-    return tuple(np.asarray(piece_vertices, dtype=float) for piece_vertices, _ in pieces)
+    low, high = vertices.min(axis=0) - _WALL, vertices.max(axis=0) + _WALL
+    block = Manifold.cube(tuple(high - low)).translate(tuple(low))
+    return mesh_of(block - solid_of(vertices, faces[:, ::-1]))
 
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
