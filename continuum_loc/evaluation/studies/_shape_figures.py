@@ -63,7 +63,7 @@ def _curves_of_methods(groove: dict[str, Any], path: Path) -> None:
     for axis, (method, title) in zip(axes[0], TITLES.items(), strict=True):
         _shape(axis, groove, method)
         axis.set_title(title, fontsize=11)
-    axes[0, 0].legend(fontsize=8)
+    axes[0, 0].legend(fontsize=8, loc="lower right")
     figure.suptitle(f"{COMPARED} groove, calibrated")
     _finish(figure, path)
 
@@ -99,7 +99,7 @@ def _curves_of_grooves(data: dict[str, dict[str, Any]], path: Path) -> None:
     for axis, (name, groove) in zip(axes[0], data.items(), strict=True):
         _shape(axis, groove, "kasa_arc")
         axis.set_title(f"{name} groove" if name == "straight" else f"groove of {name}", fontsize=11)
-    axes[0, 0].legend(fontsize=8)
+    axes[0, 1].legend(fontsize=8, loc="lower right")
     figure.suptitle("Kasa arc, calibrated")
     _finish(figure, path)
 
