@@ -93,9 +93,10 @@ def bent(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.
     return profile(robot, lambda s: (np.full_like(s, curvature), np.full_like(s, azimuth)))
 
 
-def s_shape(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.ndarray:
-    """(N, 3) strain of an S, whose curvature passes smoothly from `curvature` [1/m] at the base to its opposite."""
-    return profile(robot, lambda s: (curvature * np.cos(np.pi * s / robot.length), np.full_like(s, azimuth)))
+def s_shape(robot: RobotDescription, curvature: float, azimuth: float = 0.0, halves: float = 1.0) -> np.ndarray:
+    """(N, 3) strain of an S, whose curvature passes smoothly from `curvature` [1/m] at the base to its opposite
+    `halves` times; from 2 on its tangent turns across the magnet's axis."""
+    return profile(robot, lambda s: (curvature * np.cos(halves * np.pi * s / robot.length), np.full_like(s, azimuth)))
 
 
 def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi / 2) -> np.ndarray:

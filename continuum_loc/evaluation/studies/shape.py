@@ -127,6 +127,7 @@ def _free_rows(seed: int) -> list[Row]:
     calibration = calibrate(robot, arm.calibration_rests())
     azimuth = np.random.default_rng(seed).uniform(-np.pi, np.pi)
     shapes = {"arc, R 80 mm": bent(robot, 12.5, azimuth), "S, 20 1/m": s_shape(robot, 20.0, azimuth),
+              "S across the axis, 25 1/m": s_shape(robot, 25.0, azimuth, halves=2.4),
               "out of plane, 90 deg": out_of_plane(robot, 15.0),
               "out of plane, 180 deg": out_of_plane(robot, 15.0, np.pi)}
     rows = []
