@@ -26,6 +26,7 @@ from continuum_loc.robot import load_robot
 
 ROBOT = load_robot("soft_arm")
 FRAMES = 40
+WIDE = AnomalySettings(cell=0.03)
 PERIOD = 66_666_667  # ns
 
 
@@ -212,12 +213,12 @@ def test_points_on_the_map_pass_the_chi2_test_at_its_level():
 
 def test_witnesses_to_the_contrary_lower_the_confidence():
     rng = np.random.default_rng(6)
-    places, stamps = rng.uniform(0, 0.01, (60, 3)), np.arange(60)
-    alone = clusters(Evidence(places, np.ones(60, bool), stamps), "added", AnomalySettings())
-    disputed = clusters(Evidence(places, np.arange(60) % 3 > 0, stamps), "added", AnomalySettings())
-    denied = clusters(Evidence(places, np.arange(60) % 3 == 0, stamps), "added", AnomalySettings())
+    places, stamps = rng.uniform(0, 0.03, (60, 3)), np.arange(60)
+    alone = clusters(Evidence(places, np.ones(60, bool), stamps), "added", WIDE)
+    disputed = clusters(Evidence(places, np.arange(60) % 3 > 0, stamps), "added", WIDE)
+    denied = clusters(Evidence(places, np.arange(60) % 3 == 0, stamps), "added", WIDE)
     assert alone[0].confidence > 0.9 > disputed[0].confidence > 0.4 and denied == []
-    one_frame = clusters(Evidence(places, np.ones(60, bool), np.zeros(60)), "added", AnomalySettings())
+    one_frame = clusters(Evidence(places, np.ones(60, bool), np.zeros(60)), "added", WIDE)
     assert one_frame == []
 
 

@@ -40,6 +40,8 @@ class AnomalySettings(Settings):
     cell: float = Field(0.015, gt=0.0, description="edge of the cells in which evidence is gathered [m]")
     min_share: float = Field(0.5, gt=0.0, le=1.0, description="share of disagreeing beams that makes a cell suspect")
     min_beams: int = Field(6, ge=1, description="disagreeing beams that a cluster needs")
+    min_size: float = Field(0.02, ge=0.0, description="extent that a cluster needs [m]: map edges fray by less")
+    disc: float = Field(0.6, gt=0.0, description="radius of the map's discs, in spacings; larger ones overhang edges")
     min_frames: int = Field(2, ge=1, description="different instants that they must come from")
     link: float = Field(0.03, gt=0.0, description="cells closer than this belong to one cluster [m]")
     confidence_z: float = Field(1.64, gt=0.0, description="standard deviations of the confidence's lower bound")
@@ -81,16 +83,22 @@ def detect_anomalies(reconstruction: Reconstruction, prior: PriorMap, settings: 
     """All differences of both kinds, most confident first. `index`: of `prior`, if there is one already."""
     settings = settings or AnomalySettings()
     index = index or prior.index(reach=0.05)
-    added = clusters(new_evidence(reconstruction, prior, settings, index), "added", settings)
-    missing = clusters(missing_evidence(reconstruction, prior, settings, index), "missing", settings)
+    gone, through = missing_evidence(reconstruction, prior, settings, index)
+    missing = clusters(gone, "missing", settings)
+    added = clusters(new_evidence(reconstruction, prior, settings, index, through), "added", settings)
     return sorted(added + missing, key=lambda cluster: -cluster.confidence)
 
 
 def new_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings,
-                 index: VoxelIndex) -> Evidence:
-    """Every measured point: does it lie off the map (eq. 12)?"""
+                 index: VoxelIndex, through: np.ndarray | None = None) -> Evidence:
+    """Every measured point: does it lie off the map (eq. 12)?
+
+    Not of a beam that went `through` (N,) the map: what a missing thing has laid open is no new thing.
+    """
     distance2, offset = mahalanobis2(reconstruction, prior, settings.search_radius, index)
     disagrees = (distance2 > settings.tau) & (offset > settings.min_distance)
+    if through is not None:
+        disagrees &= ~through
     return Evidence(reconstruction.points, disagrees, reconstruction.stamps)
 
 
@@ -115,8 +123,9 @@ def tangential_variance(prior: PriorMap) -> float:
 
 
 def missing_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings,
-                     index: VoxelIndex) -> Evidence:
-    """Every mapped surface that a beam should have met first: did the beam go through it, or end on it?
+                     index: VoxelIndex) -> tuple[Evidence, np.ndarray]:
+    """Every mapped surface that a beam should have met first: did the beam go through it, or end on it? And for each
+    measured point (N,), whether its beam did go through.
 
     A beam that ends in front of the mapped surface says nothing about it. One without a return went its whole length.
     """
@@ -129,10 +138,11 @@ def missing_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: 
     hit = directions[: len(r.points)]
     sigma[: len(hit)] = np.sqrt(np.einsum("ni,nij,nj->n", hit, r.covariance, hit))
     margin = np.maximum(np.sqrt(settings.tau * (sigma**2 + prior.sigma**2)), settings.min_distance)
-    row, depth = first_crossings(prior, index, origins, directions, length + margin)
-    met = row >= 0
+    row, depth = first_crossings(prior, index, origins, directions, length + margin,
+                                 radius=settings.disc * prior.spacing)
+    met, through = row >= 0, length - depth > margin
     stamps = np.concatenate([r.stamps, np.arange(len(r.open_origins))])
-    return Evidence(prior.points[row[met]], (length - depth > margin)[met], stamps[met])
+    return Evidence(prior.points[row[met]], through[met], stamps[met]), through[: len(r.points)]
 
 
 def clusters(evidence: Evidence, kind: Kind, settings: AnomalySettings) -> list[AnomalyCluster]:
@@ -169,6 +179,8 @@ def _cluster(evidence: Evidence, members: np.ndarray, kind: Kind, settings: Anom
     if len(against) < settings.min_beams or frames < settings.min_frames:
         return None
     points = evidence.places[against]
+    if np.ptp(points, axis=0).max() < settings.min_size:
+        return None
     return AnomalyCluster(kind, points, points.mean(axis=0), np.ptp(points, axis=0), len(against), frames,
                           wilson_lower_bound(len(against), len(members), settings.confidence_z))
 
