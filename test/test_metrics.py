@@ -145,6 +145,8 @@ def test_stamps_must_increase_and_shapes_must_match():
 def test_truth_samples_are_put_in_order():
     samples = [TruthSample(stamp, np.tile(np.eye(4) * 1.0, (3, 1, 1))) for stamp in (30, 10, 20, 10)]
     assert Track.from_truth(samples, NAMES[1:]).stamps.tolist() == [10, 20, 30]
+    with pytest.raises(TrackError, match="holds 3 poses; this robot has 2: base, ring1"):
+        Track.from_truth(samples, NAMES[1:2])
 
 
 @given(st.lists(st.integers(0, 4 * 10**18), min_size=1, max_size=5, unique=True), st.integers(0, 2**32 - 1))

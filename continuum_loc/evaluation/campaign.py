@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 # Address of a Dask scheduler that runs the work instead of processes of our own; none by default.
 SCHEDULER: ContextVar[str] = ContextVar("scheduler", default="")
 
+CONNECT_LIMIT = 10  # s
+
 Progress = Callable[[Iterator[Any], int, str], Iterator[Any]]
 
 
@@ -50,7 +52,7 @@ def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: Es
     The number of jobs changes nothing but the time: each trial is seeded and runs in one process by itself.
     """
     progress = progress or show_progress
-    bags = {trial.recording: trial for trial in trials if not _bag(out, trial).is_dir()}
+    bags = {trial.recording: trial for trial in trials if not bag_of(out, trial).is_dir()}
     failed = {}
     for done in progress(parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
         failed |= done
@@ -85,7 +87,7 @@ def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterat
     except ImportError:
         raise CampaignError("a scheduler needs Dask: pip install distributed") from None
     try:
-        client = Client(address, timeout=10)
+        client = Client(address, timeout=CONNECT_LIMIT)
     except (OSError, TimeoutError, ValueError) as error:
         raise CampaignError(f"no Dask scheduler at {address} ({error or type(error).__name__})") from None
     with client:
@@ -101,7 +103,8 @@ def _one_thread() -> None:
         os.environ[name] = "1"
 
 
-def _bag(out: Path, trial: Trial) -> Path:
+def bag_of(out: Path, trial: Trial) -> Path:
+    """Where the campaign in `out` keeps the bag of a trial."""
     return out / "bags" / trial.recording
 
 
@@ -109,7 +112,7 @@ def _record(out: Path, trial: Trial) -> dict[str, str]:
     """Simulate into a bag. Returns {recording: error} of what failed."""
     from continuum_loc.evaluation.trials import simulate, write_bag
 
-    bag = _bag(out, trial)
+    bag = bag_of(out, trial)
     partial = bag.with_name(f".{bag.name}.{os.getpid()}")
     try:
         bag.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +128,7 @@ def _estimate(out: Path, trial: Trial, settings: EstimatorSettings | None) -> Ou
     """Replay a trial's bag, or take the result of an earlier run with the same configuration."""
     folder = out / "trials" / trial.name
     try:
-        return _run(folder, _bag(out, trial), trial, settings)
+        return _run(folder, bag_of(out, trial), trial, settings)
     except Exception as error:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "error.txt").write_text(traceback.format_exc())
