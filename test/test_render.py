@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 
 from continuum_loc.robot import load_robot
-from continuum_loc.simulator.render import BODY, RING, SKY, Camera, Shape, render, robot_shapes
+from continuum_loc.simulator.render import (
+    ADDED,
+    BODY,
+    MISSING,
+    RING,
+    SKY,
+    Camera,
+    Shape,
+    render,
+    robot_shapes,
+    scene_shapes,
+)
+from continuum_loc.simulator.scenes import load_scene
 
 trimesh = pytest.importorskip("trimesh")
 RED = (1.0, 0.0, 0.0)
@@ -45,3 +57,26 @@ def test_a_robot_has_a_body_a_band_per_ring_and_a_box_per_sensor():
     body = trimesh.Trimesh(shapes[0].vertices, shapes[0].faces)
     assert body.is_watertight
     assert abs(body.volume) == pytest.approx(np.pi * robot.radius**2 * robot.length, rel=0.02)
+
+
+def test_daylight_leaves_an_inner_corner_darker_than_the_open_floor():
+    floor = Shape(np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]), RED)
+    wall = Shape(np.array([[-9.0, 0, 0], [9, 0, 0], [9, 0, 9], [-9, 0, 9]]), np.array([[0, 1, 2], [0, 2, 3]]), RED)
+    camera = Camera((0.0, -1.0, 1.0), (0.0, -0.4, 0.0), fov_deg=50.0, width=40, height=40)
+    even, shaded = (render([floor, wall], camera, rays)[..., 0].astype(float) for rays in (0, 64))
+    darkening = (shaded / even)[:, 20]
+    assert darkening[-1] > 0.98  # 60 cm from the wall: the whole sky within reach
+    assert darkening.min() < 0.85  # at the foot of the wall: half of it
+
+
+def test_changes_to_the_engine_stand_out():
+    """Each change of S8 has its own shape, in the colour of what came or of what went."""
+    scene = load_scene("S8")
+    shapes = scene_shapes(scene)
+    gone = [anomaly for anomaly in scene.anomalies if anomaly.kind == "missing"]
+    assert [shape.colour for shape in shapes].count(MISSING) == len(gone)
+    added = next(shape for shape in shapes if shape.colour == ADDED)
+    places = added.vertices[np.unique(added.faces)]
+    for anomaly in scene.anomalies:
+        near = np.linalg.norm(places - anomaly.centre, axis=1).min() < anomaly.size
+        assert near == (anomaly.kind == "added"), anomaly.name
