@@ -9,7 +9,7 @@ import numpy as np
 
 from continuum_loc.shape import curves
 
-TITLES = {"quadratic_bezier": "Piecewise quadratic Bezier", "cubic_bezier": "Cubic Bezier", "kasa_arc": "Kasa arc"}
+TITLES = {"quadratic_bezier": "Quadratic Bezier pieces", "cubic_bezier": "Cubic Bezier", "kasa_arc": "Kasa arc"}
 COLOURS = {"quadratic_bezier": "#0072b2", "cubic_bezier": "#d55e00", "kasa_arc": "#009e73",
            "straight": "#0072b2", "160 mm": "#d55e00", "80 mm": "#009e73"}
 COMPARED = "160 mm"
@@ -76,14 +76,15 @@ def _error_panel(axis: Any, groove: dict[str, Any], method: str, key: str, colou
 
 def _labelled(figure: Any, axes: Any, titles: tuple[str, ...], path: Path) -> None:
     for axis, title in zip(axes, titles, strict=True):
-        axis.set(xlabel="arclength [mm]", ylabel="error [mm]", title=title)
-        axis.set_ylim(bottom=0.0)
-        axis.legend(fontsize=8)
+        axis.set(xlabel="arclength [mm]", ylabel="error [mm]")
+        axis.set_title(title, fontsize=10)
+        axis.set_ylim(0.0, 1.35 * axis.get_ylim()[1])  # room for the legend
+        axis.legend(fontsize=7, loc="upper left")
         axis.grid(alpha=0.3)
     _finish(figure, path)
 
 
-PIPELINES = {"ours": "calibrated", "mended": "the paper's pipeline, mended", "printed": "the paper's, as printed"}
+PIPELINES = {"ours": "calibrated", "mended": "the paper's, mended", "printed": "the paper's, as printed"}
 
 
 def _errors_of_methods(groove: dict[str, Any], path: Path) -> None:
@@ -91,7 +92,7 @@ def _errors_of_methods(groove: dict[str, Any], path: Path) -> None:
     for axis, key in zip(axes[0], PIPELINES, strict=True):
         for method, title in TITLES.items():
             _error_panel(axis, groove, method, key, COLOURS[method], title)
-    _labelled(figure, axes[0], tuple(f"{COMPARED} groove, {name}" for name in PIPELINES.values()), path)
+    _labelled(figure, axes[0], tuple(f"{COMPARED} groove: {name}" for name in PIPELINES.values()), path)
 
 
 def _curves_of_grooves(data: dict[str, dict[str, Any]], path: Path) -> None:
