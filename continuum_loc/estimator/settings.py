@@ -106,6 +106,9 @@ class RecoverySettings(Settings):
     score_gate: float = Field(0.3, gt=0.0, description="farthest map point that a zone may match in the search [m]")
     score_floor: float = Field(0.03, gt=0.0, description="noise that stands for the search's coarseness [m]")
     margin: float = Field(0.1, ge=0.0, description="share by which another body's cost must be lower to be taken")
+    sensor_share: float = Field(0.6, ge=0.0, le=1.0, description="share of fitting samples below which one sensor "
+                                                                 "among healthy ones is suspect")
+    suspect_weight: float = Field(0.05, gt=0.0, le=1.0, description="weight of a suspect ToF sensor")
     lost_sigma: tuple[float, float] = Field((0.1, 0.3), description="spread added to the tip's pose while lost, less "
                                                                     "towards the base [m, rad]")
 
@@ -118,6 +121,7 @@ class EstimatorSettings(Settings):
     lag: float = Field(0.3, ge=0.0, description="age of the smoothed output; at most the window [s]")
     output_rate: float = Field(15.0, gt=0.0, description="steps per second of data without ToF sensors to set the pace")
     node_spacing: float = Field(0.16, gt=0.0, description="greatest distance between nodes on the backbone [m]")
+    history: float = Field(60.0, ge=0.0, description="time behind the window that queries reach [s]")
     backbone_points: int = Field(61, ge=2, description="poses of the published backbone")
     prior: PriorSettings = PriorSettings()
     tof: TofSettings = TofSettings()

@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from continuum_loc import lie
 from continuum_loc.estimator.chain import Chain, Message, SingularError
@@ -28,6 +29,7 @@ from continuum_loc.measurements import ImuSample, Measurement, TofFrame, seconds
 from continuum_loc.robot import RobotDescription
 
 TIME_EPSILON = 1e-9  # stamps are integer nanoseconds
+HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt and no single sensor
 PATIENCE = 1.5  # ToF periods that a cycle waits for silent sensors
 DAMPING_LIMIT = 1e4
 REST_TURN = 0.005  # [rad] a body that turned farther during the initial rest was not at rest
@@ -40,7 +42,7 @@ class SlidingWindowFilter:
     """Pose, strain and velocity of the whole body, online.
 
     robot: the description; prior_map: a `PriorMap`, or None for a robot without ToF sensors.
-    counts: {"received" | "used" | "dropped": Counter}, dropped by reason.
+    counts: {"received" | "used" | "dropped" | "restarts": Counter}, the latter two by reason.
     """
 
     def __init__(self, robot: RobotDescription, prior_map=None, settings: EstimatorSettings | None = None):
@@ -56,7 +58,8 @@ class SlidingWindowFilter:
             self._shapes = ShapeSearch(self.grid, self.tof, self.settings.recovery, self.priors.rest,
                                        np.array(self.settings.prior.strain))
         self._backbone_s = np.linspace(0.0, robot.length, self.settings.backbone_points)
-        self.counts = {"received": Counter(), "used": Counter(), "dropped": Counter()}
+        self.counts = {"received": Counter(), "used": Counter(), "dropped": Counter(), "restarts": Counter()}
+        self._threads = ThreadpoolController()
         self.reset()
 
     def reset(self) -> None:
@@ -75,6 +78,7 @@ class SlidingWindowFilter:
         self._rest: dict[str, list[np.ndarray]] | None = {}
         self._rest_bias: tuple[np.ndarray, np.ndarray] | None = None
         self.watch = Watch(self.settings.recovery)
+        self.suspects: tuple[str, ...] = ()
 
     # ------------------------------------------------------------------ measurements in, estimates out
 
@@ -201,10 +205,20 @@ class SlidingWindowFilter:
         if not self.intervals:
             return None
         started = clock.perf_counter()
+        with self._threads.limit(limits=1, user_api="blas"):  # small matrices: more threads only wait for one another
+            return self._solve(started)
+
+    def _solve(self, started: float) -> Estimate:
         if not self.acquired:
             self._guess_shape()
-        iterations, converged = self._optimise()
+        try:
+            iterations, converged = self._optimise()
+        except SingularError:
+            self.counts["restarts"]["singular"] += 1
+            self._keep_newest_intervals(1)
+            iterations, converged = 0, False
         self._finish_rest()
+        self._find_suspects()
         if self.tof is not None and self.settings.recovery.enabled:
             self._look_after(converged)
         else:
@@ -372,13 +386,27 @@ class SlidingWindowFilter:
             self.watch.searched(time, confirmed=self._search())
 
     def _worst_share(self) -> float:
-        """Least share of fitting zones over the rings, in the newest interval that has ToF frames."""
+        """Least share of fitting zones over the rings, in the newest interval that has ToF frames; sensors that are
+        themselves suspect do not count."""
         fits = self._newest_fits()
         by_ring: dict[str, np.ndarray] = {}
         for sensor in self.robot.tof:
-            if sensor.name in fits:
+            if sensor.name in fits and sensor.name not in self.suspects:
                 by_ring[sensor.ring] = by_ring.get(sensor.ring, 0.0) + fits[sensor.name]
         return min((fit[1] / fit[0] for fit in by_ring.values() if fit[0] > 0), default=1.0)
+
+    def _find_suspects(self) -> None:
+        """Sensors that do not fit while the others do: a wrong extrinsic, a wrong clock, a broken part."""
+        options, fits = self.settings.recovery, self._fit()[2]
+        suspects = []
+        for sensors in (self.robot.tof, self.robot.imu):
+            names = [sensor.name for sensor in sensors if sensor.name in fits]
+            healthy = names and np.median([fits[name] for name in names]) > HEALTHY_SHARE
+            suspects += [name for name in names if healthy and fits[name] < options.sensor_share]
+        self.suspects = tuple(suspects)
+        if self.tof is not None:
+            for name in self.tof.weights:
+                self.tof.weights[name] = options.suspect_weight if name in suspects else 1.0
 
     def _newest_fits(self) -> dict[str, np.ndarray]:
         for interval in reversed(self.intervals):
@@ -453,7 +481,7 @@ class SlidingWindowFilter:
             backbone_s=self._backbone_s,
             T_map_backbone=backbone(self.grid, body.T, body.strain, self._backbone_s),
             status=self._status(), consistency=squared / max(count, 1),
-            inliers=inliers, iterations=iterations, converged=converged, step_seconds=elapsed, lagged=lagged)
+            inliers=inliers, suspects=self.suspects, iterations=iterations, converged=converged, step_seconds=elapsed, lagged=lagged)
 
     def _status(self) -> str:
         if self.watch.lost:

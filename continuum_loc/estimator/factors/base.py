@@ -60,6 +60,22 @@ class Factor(ABC):
         """Add the normal equations of `batch` between the columns a and b."""
 
 
+class Repeats:
+    """Tells a frozen sensor: one whose samples are the same to the last bit more than `most` times in a row."""
+
+    def __init__(self, most: int):
+        self._most = most
+        self._last: dict[str, bytes] = {}
+        self._count: dict[str, int] = {}
+
+    def frozen(self, sensor: str, values: np.ndarray) -> bool:
+        """Note a sample; True when the sensor has repeated itself too often."""
+        data = np.ascontiguousarray(values).tobytes()
+        self._count[sensor] = self._count.get(sensor, 0) + 1 if self._last.get(sensor) == data else 0
+        self._last[sensor] = data
+        return self._count[sensor] > self._most
+
+
 def require_finite(values: np.ndarray, what: str, sensor: str) -> None:
     """Raise MeasurementError unless every value is finite."""
     if not np.all(np.isfinite(values)):

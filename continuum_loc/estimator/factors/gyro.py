@@ -7,9 +7,19 @@ from numba import njit
 
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, known_sensor, require_finite
+from continuum_loc.estimator.factors.base import (
+    Factor,
+    FactorReport,
+    MeasurementError,
+    Repeats,
+    known_sensor,
+    require_finite,
+)
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.measurements import ImuSample
+
+FIT_SQUARED = 16.3  # 99.9 % of a chi-square of three dimensions
+MOST_REPEATS = 20  # a real gyro at rest repeats a sample now and then, through its quantisation
 
 
 class GyroFactor(Factor):
@@ -20,6 +30,7 @@ class GyroFactor(Factor):
 
     def __init__(self, robot, grid, settings):
         super().__init__(robot, grid, settings)
+        self._repeats = Repeats(MOST_REPEATS)
         self._imus = {imu.name: (number, grid.node_at(robot.sensor_arclength(imu.name)),
                                  imu.mount.T_ring_sensor[:3, :3]) for number, imu in enumerate(robot.imu)}
         self._weight = (settings.gyro.scale * robot.imu_model.gyro_sigma) ** -2.0
@@ -30,6 +41,8 @@ class GyroFactor(Factor):
         if np.max(np.abs(measurement.angular_velocity)) > self.robot.imu_model.gyro_range:
             raise MeasurementError("saturated", f"gyro '{measurement.sensor}' beyond its full scale of "
                                                 f"{self.robot.imu_model.gyro_range} rad/s")
+        if self._repeats.frozen(measurement.sensor, measurement.angular_velocity):
+            raise MeasurementError("frozen", f"gyro '{measurement.sensor}' repeats itself to the last bit")
         return number, node, R_ring_imu @ measurement.angular_velocity
 
     def stack(self, times, rows):
@@ -38,13 +51,14 @@ class GyroFactor(Factor):
 
     def linearise(self, batch, a, b, blocks):
         times, imus, nodes, omega = batch
+        fits = np.zeros((len(self._imus), 2))
         cost, squared = _add(blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, a.bias, b.time - a.time, times,
-                             nodes, imus, omega, self._weight, self.settings.gyro.cauchy, self.grid.bias_offset)
-        return FactorReport(cost, squared, 3 * len(times))
+                             nodes, imus, omega, self._weight, self.settings.gyro.cauchy, self.grid.bias_offset, fits)
+        return FactorReport(cost, squared, 3 * len(times), dict(zip(self._imus, fits, strict=True)))
 
 
 @njit(cache=True)
-def _add(H, g, T_a, v_a, T_b, v_b, bias, dt, times, nodes, imus, omega, weight, cauchy, bias_offset):
+def _add(H, g, T_a, v_a, T_b, v_b, bias, dt, times, nodes, imus, omega, weight, cauchy, bias_offset, fits):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
@@ -67,6 +81,8 @@ def _add(H, g, T_a, v_a, T_b, v_b, bias, dt, times, nodes, imus, omega, weight, 
         for i in range(3):
             weights[i] = weight * robust
         gp.add_rows(H, g, index, e, J, weights)
+        fits[imus[m], 0] += 1.0
+        fits[imus[m], 1] += 1.0 if u2 < FIT_SQUARED else 0.0
         cost += 0.5 * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
         squared += u2 * robust
     return cost, squared

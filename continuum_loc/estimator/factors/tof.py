@@ -12,11 +12,12 @@ from numba import njit
 
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, known_sensor
+from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, Repeats, known_sensor
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.mapping.voxel_index import nearest_facing
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 
+MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
 FIT_SIGMAS = 3.0  # a zone within so many sigmas of its surface counts as fitting
 HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
 
@@ -35,6 +36,7 @@ class TofFactor(Factor):
                                        sensor.mount.T_ring_sensor) for number, sensor in enumerate(robot.tof)}
         self._names = list(self._sensors)
         self._index = index
+        self._repeats = Repeats(MOST_REPEATS)
         if prior_map is not None:
             self._cloud, self._normals = np.ascontiguousarray(prior_map.points), np.ascontiguousarray(prior_map.normals)
             self._planarity = prior_map.planarity**settings.tof.planarity_power
@@ -59,6 +61,8 @@ class TofFactor(Factor):
         with np.errstate(invalid="ignore"):
             ranges = np.linalg.norm(points, axis=1)
             usable = np.isfinite(ranges) & (ranges >= model.min_range) & (ranges <= model.max_range)
+        if np.any(usable) and self._repeats.frozen(measurement.sensor, points):
+            raise MeasurementError("frozen", f"ToF sensor '{measurement.sensor}' repeats itself to the last bit")
         half = np.isin(measurement.status, TOF_HALF_CONFIDENT)
         usable &= (measurement.status == TOF_VALID) | half
         distance = np.where(usable, ranges, 1.0)
