@@ -52,15 +52,22 @@ def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: Es
     The number of jobs changes nothing but the time: each trial is seeded and runs in one process by itself.
     """
     progress = progress or show_progress
-    bags = {trial.recording: trial for trial in trials if not bag_of(out, trial).is_dir()}
-    failed = {}
-    for done in progress(parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
-        failed |= done
+    failed = record_bags(trials, out, jobs, progress)
     todo = [(out, trial, settings) for trial in trials if trial.recording not in failed]
     found = {}
     for outcome in progress(parallel(_estimate, todo, jobs), len(todo), "estimating"):
         found[outcome.trial] = outcome
     return [found.get(trial) or Outcome(trial, None, failed[trial.recording]) for trial in trials]
+
+
+def record_bags(trials: Sequence[Trial], out: Path, jobs: int = 1, progress: Progress | None = None) -> dict[str, str]:
+    """Simulate the recordings of `trials` that `out` does not hold yet. Returns {recording: error} of what failed."""
+    progress = progress or show_progress
+    bags = {trial.recording: trial for trial in trials if not bag_of(out, trial).is_dir()}
+    failed = {}
+    for done in progress(parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
+        failed |= done
+    return failed
 
 
 def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]:
