@@ -435,8 +435,25 @@ def test_contacts_hold_the_body_out_of_the_scene(robot):
 
 
 def test_unknown_trajectories_name_the_valid_ones():
-    with pytest.raises(SettingsError, match="no trajectory 't9'; trajectories: t1, t2, t3"):
+    with pytest.raises(SettingsError, match="no trajectory 't9'; give a .yaml file of your own, or one of t1, t2, t3"):
         World(load_robot("engine"), None, "t9")
+
+
+def test_a_trajectory_of_ones_own_is_read_from_yaml(tmp_path):
+    path = tmp_path / "lean.yaml"
+    path.write_text("keyframes:\n  - {time: 1.0, tensions: [1, 1, 1, 1]}\n  - {time: 3.0, tensions: [1, 9, 1, 1]}\n")
+    made = trajectory(str(path), load_robot("soft_arm"), load_plant("soft_arm"))
+    assert made.name == "lean" and made.duration == 3.0
+    np.testing.assert_allclose(made.command(0.5).tension, 1.0)
+    np.testing.assert_allclose(made.command(9.0).tension, [1, 9, 1, 1])
+    with pytest.raises(SettingsError, match=r"lean.yaml: keyframes.0.tensions: 4 values for the plant's 9 tendons"):
+        trajectory(str(path), load_robot("engine"), load_plant("engine"))
+    path.write_text("keyframes:\n  - {time: 0.2, tensions: [1]}\n  - {time: 3.0, tension: [1]}\n")
+    with pytest.raises(SettingsError, match=r"(?s)keyframes.0.time.*unknown key 'keyframes.1.tension'; did you mean"):
+        trajectory(str(path), load_robot("soft_arm"), load_plant("soft_arm"))
+    path.write_text("keyframes:\n  - {time: 3.0, tensions: [1, 1, 1, 1]}\n  - {time: 2.0, tensions: [1, 1, 1, 1]}\n")
+    with pytest.raises(SettingsError, match="lean.yaml: .*increasing times"):
+        trajectory(str(path), load_robot("soft_arm"), load_plant("soft_arm"))
 
 
 def test_a_trajectory_for_other_drives_is_refused():

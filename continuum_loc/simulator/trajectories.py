@@ -8,12 +8,14 @@ rates continuous and never overshoots a keyframe: no tension is commanded that t
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 from scipy.interpolate import PchipInterpolator
 
 from continuum_loc.robot import RobotDescription
-from continuum_loc.settings import SettingsError
+from continuum_loc.settings import Settings, SettingsError, load_settings
 from continuum_loc.simulator.plant import PlantSettings
 
 REST = 1.0  # seconds at rest at the start
@@ -114,14 +116,54 @@ _ENGINE = {
 }
 
 
+class Keyframe(Settings):
+    """What the drives do at one time."""
+
+    time: float = Field(ge=REST, description="seconds from the start, the first of which is at rest")
+    tensions: tuple[float, ...] = Field(description="of every tendon, in the plant's order [N]")
+    insertion: float = Field(0.0, description="travel of the base [m]")
+
+
+class TrajectoryFile(Settings):
+    """A trajectory of your own, as YAML: `keyframes`, and whether the arm is `supported` against gravity."""
+
+    keyframes: tuple[Keyframe, ...] = Field(min_length=2)
+    supported: bool = False
+
+
 def trajectory(name: str, robot: RobotDescription, plant: PlantSettings, seed: int = 0) -> Trajectory:
-    """The named trajectory of this robot. A seed other than 0 varies every keyframe after the rest by some percent."""
+    """The named trajectory of this robot, or one of your own from a YAML file (`TrajectoryFile`).
+
+    A seed other than 0 varies every keyframe after the rest by some percent.
+    """
+    if name.endswith((".yaml", ".yml")):
+        made = _from_file(name, plant)
+    else:
+        made = _bundled(name, robot, plant)
+    return made if seed == 0 else _varied(made, np.random.default_rng(seed))
+
+
+def _bundled(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
     tables = TRAJECTORIES.get(robot.name, {})
     if name not in tables:
-        raise SettingsError(f"robot '{robot.name}' has no trajectory '{name}'; "
-                            f"trajectories: {', '.join(tables) or 'none (give a Trajectory of your own)'}")
-    made = tables[name](name, robot, plant)
-    return made if seed == 0 else _varied(made, np.random.default_rng(seed))
+        raise SettingsError(f"robot '{robot.name}' has no trajectory '{name}'; give a .yaml file of your own"
+                            + (f", or one of {', '.join(tables)}" if tables else ""))
+    return tables[name](name, robot, plant)
+
+
+def _from_file(path: str, plant: PlantSettings) -> Trajectory:
+    read = load_settings(TrajectoryFile, path)
+    frames = read.keyframes
+    for k, frame in enumerate(frames):
+        if len(frame.tensions) != len(plant.tendon_names):
+            raise SettingsError(f"{path}: keyframes.{k}.tensions: {len(frame.tensions)} values for the plant's "
+                                f"{len(plant.tendon_names)} tendons ({', '.join(plant.tendon_names)})")
+    try:
+        return Trajectory(Path(path).stem, np.array([frame.time for frame in frames]),
+                          np.array([frame.tensions for frame in frames]),
+                          np.array([frame.insertion for frame in frames]), read.supported)
+    except ValueError as error:
+        raise SettingsError(f"{path}: {error}") from None
 
 
 def trajectory_names(robot: RobotDescription) -> tuple[str, ...]:
