@@ -251,7 +251,7 @@ def test_room_given_by_its_inner_surface_gets_walls_outside_it():
 
 def test_mesh_that_cannot_be_decomposed_is_refused_and_does_not_end_the_process(monkeypatch):
     monkeypatch.setattr(convex, "_MODULE", "continuum_loc.no_such_module")
-    with pytest.raises(SceneError, match=r"part\.stl: cannot be split into convex pieces"):
+    with pytest.raises(SceneError, match=r"part\.stl: cannot be split .* No module named"):
         convex.convex_pieces(CUBE.vertices, CUBE.faces, "part.stl")
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 import tempfile
@@ -29,16 +30,23 @@ def convex_pieces(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[
         source, result = Path(folder, "mesh.npz"), Path(folder, "pieces.npz")
         np.savez(source, vertices=vertices, faces=faces)
         for mode in _MODES:
-            command = [sys.executable, "-m", _MODULE, source, result, mode]
-            run = subprocess.run(command, capture_output=True, check=False)
+            run = _run(_MODULE, source, result, mode)
             if run.returncode == 0:
                 with np.load(result) as pieces:
                     return tuple(pieces[name] for name in pieces.files)
             if mode != _MODES[-1]:
                 _log.warning("%s: convex decomposition failed, trying again with a remeshed surface: contact will be "
                              "coarse, to about %.0f mm", where, 1e3 * np.ptp(vertices, axis=0).max() / _REMESHING)
-    raise SceneError(f"{where}: cannot be split into convex pieces for contact (CoACD failed with status "
-                     f"{run.returncode}); simplify the mesh, or thicken its thinnest walls")
+    last_words = (run.stderr.strip().splitlines() or [f"status {run.returncode}"])[-1]
+    raise SceneError(f"{where}: cannot be split into convex pieces for contact (CoACD: {last_words}); simplify the "
+                     "mesh, or thicken its thinnest walls")
+
+
+def _run(module: str, *arguments: object) -> subprocess.CompletedProcess:
+    """Run a module of this package, also where the package is not installed but on the caller's path."""
+    search = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    return subprocess.run([sys.executable, "-m", module, *map(str, arguments)], capture_output=True, text=True,
+                          check=False, env=os.environ | {"PYTHONPATH": search})
 
 
 def _decompose(source: str, result: str, mode: str) -> None:
