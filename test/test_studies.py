@@ -62,6 +62,36 @@ def test_other_settings_are_estimated_anew(done):
     assert other[0].summary["configuration_digest"] != before[0].summary["configuration_digest"]
 
 
+def test_two_processes_give_what_one_gives(done, tmp_path):
+    _, trials, before = done
+    again = run_campaign(trials[:2], tmp_path, jobs=2)
+    assert [one.summary["digest"] for one in again] == [one.summary["digest"] for one in before[:2]]
+
+
+def test_a_dask_cluster_gives_what_one_process_gives(done, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="Dask is an optional extra")
+    _, trials, before = done
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        token = campaign.SCHEDULER.set(cluster.scheduler_address)
+        try:
+            again = run_campaign(trials[:2], tmp_path)
+        finally:
+            campaign.SCHEDULER.reset(token)
+    assert [one.summary["digest"] for one in again] == [one.summary["digest"] for one in before[:2]]
+
+
+def test_a_scheduler_that_is_not_there_is_named(done, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="Dask is an optional extra")
+    _, trials, _ = done
+    monkeypatch.setattr(campaign, "CONNECT_LIMIT", 1)
+    token = campaign.SCHEDULER.set("tcp://127.0.0.1:1")
+    try:
+        with pytest.raises(campaign.CampaignError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:1"):
+            run_campaign(trials[:1], tmp_path)
+    finally:
+        campaign.SCHEDULER.reset(token)
+
+
 def test_a_failure_while_estimating_leaves_its_traceback(done, monkeypatch, tmp_path):
     _, trials, _ = done
 

@@ -113,7 +113,8 @@ def judge(outcomes: list[Outcome], results: list[SceneResult], curve: list[dict[
 def row(result: SceneResult) -> dict[str, Any]:
     """One scene of the table."""
     return {"scene": result.scene, "points": result.points, "RMSE [cm]": 100 * result.rmse_m,
-            "RMSE, true poses [cm]": 100 * result.rmse_true_poses_m, "anomalies": result.known, "seen": len(result.truth), "clusters": len(result.clusters)}
+            "RMSE, true poses [cm]": 100 * result.rmse_true_poses_m, "anomalies": result.known,
+            "seen": len(result.truth), "clusters": len(result.clusters)}
 
 
 def cluster_rows(results: list[SceneResult]) -> list[dict[str, Any]]:
