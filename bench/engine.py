@@ -31,7 +31,8 @@ def run(quick: bool = False) -> list[dict]:
     with _one_core():
         _replayed(samples[: len(samples) // 8], settings)
         result = _replayed(samples, settings)
-        rows = [_row("engine, a second of data", 1.0 / result.real_time_factor)]
+        rows = [_row("engine, a second of data", 1.0 / result.real_time_factor),
+                _row("engine, processor time of it", result.cpu_seconds / result.data_seconds)]
         rows += [_row(f"engine, step p{q}", float(np.percentile(result.step_seconds, q))) for q in (50, 95, 99)]
         if not quick:
             rows += list(_sizes(samples, settings))

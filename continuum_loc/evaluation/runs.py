@@ -91,7 +91,8 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
         **summarise(errors(judged, result.truth)),
         "lagged": summarise(errors(settled(result.lagged), result.truth)) if len(result.lagged) else None,
         "real_time_factor": result.real_time_factor,
-        "data_seconds": result.data_seconds,
+        "data_seconds": result.data_seconds, "processing_seconds": result.processing_seconds,
+        "processing_cpu_seconds": result.cpu_seconds,
         "step_ms": distribution(1e3 * result.step_seconds),
         "estimates": {"all": len(result.track), "judged": len(associate(judged, result.truth)[0]),
                       **{name: int((status == name).sum()) if status is not None else 0
@@ -134,7 +135,7 @@ def _save_result(path: Path, result: ReplayResult) -> None:
         "latency_seconds": result.latency_seconds, "cloud_stamps": result.cloud.stamps,
         "cloud_points": result.cloud.points, "names": np.array(result.track.names),
         "processing_seconds": result.processing_seconds, "data_seconds": result.data_seconds,
-        "counts": json.dumps(plain(result.counts))}
+        "cpu_seconds": result.cpu_seconds, "counts": json.dumps(plain(result.counts))}
     for name in TRACKS:
         track = getattr(result, name)
         arrays |= {f"{name}_{item.name}": getattr(track, item.name) for item in fields(Track)
@@ -155,4 +156,5 @@ def _load_result(path: Path) -> ReplayResult:
         **{name: track(name) for name in TRACKS}, consistency=data["consistency"],
         step_seconds=data["step_seconds"], processing_seconds=float(data["processing_seconds"]),
         data_seconds=float(data["data_seconds"]), cloud=Cloud(data["cloud_stamps"], data["cloud_points"]),
-        counts=json.loads(str(data["counts"])), latency_seconds=data["latency_seconds"])
+        cpu_seconds=float(data["cpu_seconds"]), counts=json.loads(str(data["counts"])),
+        latency_seconds=data["latency_seconds"])
