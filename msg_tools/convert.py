@@ -198,16 +198,17 @@ def _octets(status: np.ndarray, where: str) -> np.ndarray:
 
 
 def imu_message(make: Messages, sample: ImuSample) -> Any:
-    """Imu without orientation (REP-145: orientation_covariance[0] = -1)."""
-    no_orientation = np.zeros(9)
-    no_orientation[0] = -1.0
+    """Imu without orientation (REP-145: a covariance that begins with -1), and a gyro alone without acceleration."""
+    absent = np.zeros(9)
+    absent[0] = -1.0
+    gyro_alone = np.isnan(sample.linear_acceleration).all()
     return make("sensor_msgs/msg/Imu", header=header_message(make, sample.stamp, sample.sensor),
                 orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-                orientation_covariance=no_orientation,
+                orientation_covariance=absent,
                 angular_velocity=_vector_message(make, sample.angular_velocity),
                 angular_velocity_covariance=np.zeros(9),
-                linear_acceleration=_vector_message(make, sample.linear_acceleration),
-                linear_acceleration_covariance=np.zeros(9))
+                linear_acceleration=_vector_message(make, np.zeros(3) if gyro_alone else sample.linear_acceleration),
+                linear_acceleration_covariance=absent if gyro_alone else np.zeros(9))
 
 
 def imu_sample(message: Any, where: str = "imu/data_raw") -> ImuSample:
