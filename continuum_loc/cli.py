@@ -94,6 +94,20 @@ def simulate(bag: Annotated[Path, typer.Argument(help="new bag folder to write")
     _count_table(counts, f"{bag}: {seconds:g} s")
 
 
+@app.command("import-trial")
+def import_trial_command(folder: Annotated[Path, typer.Argument(help="folder of one recorded trial's CSV files")],
+                         bag: Annotated[Path, typer.Argument(help="new bag folder to write")],
+                         robot: Annotated[str, typer.Option(help="which sensor sits where")] = "tendon_robot") -> None:
+    """Write a recorded trial of the tendon-driven robot, measurements and truth, into a bag.
+
+    Example: `continuum-loc import-trial slow_free_space /tmp/slow`
+    """
+    from continuum_loc.robot import load_robot
+    from msg_tools.tendon_robot import import_trial
+
+    _count_table(import_trial(folder, bag, load_robot(robot)), str(bag))
+
+
 @app.command()
 def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db3 file")], robot: Robot = "engine",
            map_file: MapFile = None, scene: Annotated[str, typer.Option(help="scene shown in the report, and whose "
