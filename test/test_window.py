@@ -7,7 +7,7 @@ import pytest
 from worlds import EPOCH, Rod, rod, room_map, stream
 
 from continuum_loc import lie
-from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
+from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter, smooth
 from continuum_loc.measurements import ImuSample, TofFrame, TruthSample
 from continuum_loc.settings import parse_settings
 
@@ -143,7 +143,7 @@ def test_gyro_bias_is_found_at_rest(prior_map):
               for s in stream(Rod(robot), 2.0)]
     filter_ = SlidingWindowFilter(robot, prior_map, settings(gyro={"bias_sigma": 0.1}))
     run(filter_, biased)
-    estimate = filter_.columns[-1].retract(filter_.offsets[-1]).bias
+    estimate = filter_.window.column(-1).bias
     np.testing.assert_allclose(estimate, np.array(list(bias.values())), atol=4.0 * np.hypot(0.01 / np.sqrt(50), 0.002))
 
 
@@ -163,6 +163,59 @@ def test_memory_is_bounded(prior_map):
     sizes = []
     for sample in stream(Rod(robot), 3.0):
         if not isinstance(sample, TruthSample) and filter_.process(sample):
-            sizes.append(len(filter_.columns))
+            sizes.append(len(filter_.window.columns))
     assert max(sizes[10:]) - min(sizes[10:]) <= 1
     assert max(sizes) <= 9
+
+
+def test_queries_agree_with_the_estimate_and_reach_behind_and_ahead(prior_map):
+    """Any time and arclength: rings as published, truth within 4 sigmas between them, growth ahead of the window."""
+    robot = rod()
+    motion = Rod(robot, seed=4)
+    filter_ = SlidingWindowFilter(robot, prior_map, settings())
+    estimates, _ = run(filter_, stream(motion, 3.0))
+    newest = estimates[-1]
+    state = filter_.query(newest.stamp, 0.3)
+    np.testing.assert_allclose(state.T_map_body, newest.T_map_ring[1], atol=1e-9)
+    np.testing.assert_allclose(state.covariance[:6, :6], newest.covariance[1], rtol=1e-6, atol=1e-15)
+    for time in (0.7, 1.4, 2.5, 2.9):
+        for s in (0.1, 0.25, 0.4, 0.55):
+            state = filter_.query(EPOCH + round(time * 1e9), s)
+            e = lie.log(lie.inverse(state.T_map_body) @ motion.poses(time, np.array([s]))[0])
+            assert np.all(np.abs(e) < 4.0 * np.sqrt(np.diag(state.covariance)[:6]) + 1e-6)
+            assert np.linalg.eigvalsh(state.covariance)[0] > 0.0
+    later = [filter_.query(newest.stamp + round(dt * 1e9), 0.6) for dt in (0.0, 0.3, 0.6)]
+    spreads = [np.trace(state.covariance[:3, :3]) for state in later]
+    assert spreads[0] < spreads[1] < spreads[2]
+    with pytest.raises(ValueError, match="off the body; valid: 0 to 0.6 m"):
+        filter_.query(newest.stamp, 0.7)
+
+
+def test_the_batch_smoother_beats_the_filter(prior_map):
+    robot = rod()
+    samples = list(stream(Rod(robot, seed=5), 2.5))
+    estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), samples)
+    measurements = [s for s in samples if not isinstance(s, TruthSample)]
+    stamps = [e.stamp for e in estimates[8:]]
+    smoothed = smooth(robot, prior_map, settings(), measurements, stamps)
+    rms = [np.sqrt(np.mean(errors(x, truth)[:, 1:, :3] ** 2)) for x in (smoothed, estimates[8:])]
+    assert rms[0] < rms[1]
+
+
+def test_a_frozen_sensor_is_refused_and_a_wrong_extrinsic_named(prior_map):
+    """A sensor that repeats itself is dropped; one that is mounted 20 degrees off is suspected, and neither hurts."""
+    robot = rod()
+    turn = lie.exp(np.radians([0, 0, 0, 0, 0, 20.0]))[:3, :3]
+    first: dict = {}
+    samples = []
+    for s in stream(Rod(robot, seed=6), 2.0):
+        if isinstance(s, TofFrame) and s.sensor == "r1_tof0":
+            s = replace(first.setdefault("frame", s), stamp=s.stamp)
+        if isinstance(s, TofFrame) and s.sensor == "r2_tof1":
+            s = replace(s, points=s.points @ turn.T)
+        samples.append(s)
+    filter_ = SlidingWindowFilter(robot, prior_map, settings())
+    estimates, truth = run(filter_, samples)
+    assert filter_.counts["dropped"]["tof: frozen"] > 20
+    assert estimates[-1].suspects == ("r2_tof1",)
+    assert np.max(np.abs(errors(estimates, truth)[-10:, 1:, :3])) < 0.01

@@ -1,15 +1,19 @@
-"""The continuous-time sliding-window filter. Start with `window.py`."""
+"""The continuous-time sliding-window filter. Start with `filter.py`."""
 
 from __future__ import annotations
 
-__all__ = ["Estimate", "EstimatorSettings", "SlidingWindowFilter", "load_estimator_settings"]
+__all__ = ["Estimate", "EstimatorSettings", "SlidingWindowFilter", "load_estimator_settings", "smooth"]
 
 
 def __getattr__(name: str):
     if name == "SlidingWindowFilter":
-        from continuum_loc.estimator.window import SlidingWindowFilter
+        from continuum_loc.estimator.filter import SlidingWindowFilter
 
         return SlidingWindowFilter
+    if name == "smooth":
+        from continuum_loc.estimator.smoother import smooth
+
+        return smooth
     if name == "Estimate":
         from continuum_loc.estimator.estimate import Estimate
 

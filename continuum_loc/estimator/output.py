@@ -23,6 +23,20 @@ class Body:
     velocity: np.ndarray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyState:
+    """The continuous state at one instant and arclength.
+
+    T_map_body (4, 4), strain (6,), velocity (6,), and covariance (18, 18) of [pose, strain, velocity], pose
+    perturbations on the right.
+    """
+
+    T_map_body: np.ndarray
+    strain: np.ndarray
+    velocity: np.ndarray
+    covariance: np.ndarray
+
+
 def body_between(a: Column, b: Column, time: float) -> Body:
     """The body at `time` between two columns: pose and velocity by the Gaussian process's cubic Hermite, strain
     linearly."""

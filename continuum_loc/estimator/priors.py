@@ -31,7 +31,8 @@ class Priors:
         self.s = grid.s
         self.rest = np.array(robot.backbone.rest_strain)
         self.rest_information = 1.0 / np.square(robot.backbone.rest_strain_sigma)
-        self.velocity = 1.0 / np.array(prior.velocity)
+        self.velocity_psd = np.array(prior.velocity)
+        self.velocity = 1.0 / self.velocity_psd
         self.strain_rate = 1.0 / np.array(prior.strain_rate)
         self.strain = 1.0 / np.array(prior.strain)
         self.velocity_slope = 1.0 / np.array(prior.velocity_slope)

@@ -16,12 +16,20 @@ import numpy as np
 from numba import njit
 
 from continuum_loc import lie
+from continuum_loc.estimator.estimate import Status
 from continuum_loc.estimator.factors.tof import TofFactor, frame_information
+from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Column, Grid, shape_from_strain
+from continuum_loc.estimator.window import Window
+from continuum_loc.robot import RobotDescription
 
 COARSE_SPACING = 0.04  # [m] of the thinned map that the search scores against; it has to tell decimetres apart
 ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
+SEARCH_INTERVALS = 2  # the newest, whose measurements decide between bodies
+GATE_SHRINK = 0.75  # of the gate of association, at each iteration from a guess
+HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt and no single sensor
+AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
 
 
@@ -69,19 +77,122 @@ class Snapshot:
         return cls(np.array(nodes), *(np.ascontiguousarray(np.array(x)[:, ::ZONE_STRIDE]) for x in (q, rays, variance)))
 
 
+class Recovery:
+    """Acquires the body at the start, watches over it, and finds it again.
+
+    acquired: whether the filter tracks; suspects: sensors that do not fit while the others do.
+    """
+
+    def __init__(self, robot: RobotDescription, window: Window, tof: TofFactor | None, settings: RecoverySettings):
+        self.acquired = False
+        self.suspects: tuple[str, ...] = ()
+        self._robot, self._window, self._tof, self._settings = robot, window, tof, settings
+        self._watch = Watch(settings)
+        self._shapes = None if tof is None else ShapeSearch(window.grid, tof, settings, window.priors)
+
+    @property
+    def status(self) -> Status:
+        """What to tell of the body."""
+        if self._watch.lost:
+            return "lost"
+        return "tracking" if self.acquired else "initialising"
+
+    def doubt(self, s: np.ndarray) -> np.ndarray:
+        """(m, 6, 6) covariance to add at arclengths s (m,) while lost: it grows from the base to the tip."""
+        reach = (s / self._window.grid.s[-1])[:, None] if self._watch.lost else np.zeros((len(s), 1))
+        return np.square(reach * np.repeat(self._settings.lost_sigma, 3))[:, :, None] * np.eye(6)
+
+    def acquire(self) -> tuple[int, bool]:
+        """Solve the window from a guess: (iterations, whether it converged)."""
+        return self._window.acquire(self._narrow)
+
+    def look_after(self, time: float, converged: bool) -> None:
+        """Notice a wrong minimum by the worst ring's share of fitting zones, and look for a better body."""
+        self._find_suspects()
+        if self._tof is None or not self._settings.enabled:
+            self.acquired = self.acquired or converged
+            return
+        share = self._worst_share()
+        fitting = share >= self._settings.suspect_share
+        self.acquired = self.acquired or (converged and fitting)
+        due = self._watch.update(time, share)
+        if due or (not fitting and not self.acquired and time >= self._watch.next_search):
+            self._watch.searched(time, confirmed=self._search())
+
+    def _narrow(self, iteration: int) -> bool:
+        """The gate of association: wide while the shape is a guess, then down to the tracking gate."""
+        if self._tof is None:
+            return True
+        options = self._tof.settings.tof
+        gate = max(options.gate, options.acquisition_gate * GATE_SHRINK**iteration)
+        if gate != self._tof.gate:
+            self._tof.gate = gate
+            self._window.mark_changed()
+        return gate <= options.gate
+
+    def _worst_share(self) -> float:
+        """Least share of fitting zones over the rings, in the newest interval that has ToF frames; sensors that are
+        themselves suspect do not count."""
+        fits = self._window.newest_fits("tof")
+        by_ring: dict[str, np.ndarray] = {}
+        for sensor in self._robot.tof:
+            if sensor.name in fits and sensor.name not in self.suspects:
+                by_ring[sensor.ring] = by_ring.get(sensor.ring, 0.0) + fits[sensor.name]
+        return min((fit[1] / fit[0] for fit in by_ring.values() if fit[0] > 0), default=1.0)
+
+    def _find_suspects(self) -> None:
+        """Sensors that do not fit while the others do: a wrong extrinsic, a wrong clock, a broken part."""
+        shares, suspects = self._window.fit().shares, []
+        for sensors in (self._robot.tof, self._robot.imu):
+            names = [sensor.name for sensor in sensors if sensor.name in shares]
+            healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
+            suspects += [name for name in names if healthy and shares[name] < self._settings.sensor_share]
+        self.suspects = tuple(suspects)
+        if self._tof is not None:
+            for name in self._tof.weights:
+                self._tof.weights[name] = self._settings.suspect_weight if name in suspects else 1.0
+
+    def _search(self) -> bool:
+        """Try the shapes that a search finds, take one that fits better than the present body; True when the body that
+        results is to be believed: no other one fits as well."""
+        window, rings = self._window, self._window.grid.ring_nodes
+        rows = window.newest_rows(self._tof, SEARCH_INTERVALS)
+        if not rows:
+            return False
+        window.keep_newest(SEARCH_INTERVALS)
+        present = window.columns[-1]
+        tries = [self._refine()]
+        for strain in self._shapes.find(present.T[0], Snapshot.of(rows)):
+            window.place(place(window.grid, present, present.T[0], strain))
+            tries.append(self._refine())
+        margin = 1.0 + self._settings.margin
+        best = min(tries[1:], key=lambda one: one[0])
+        chosen = best if best[0] * margin < tries[0][0] else tries[0]
+        window.set_columns(chosen[1])
+        self._refine()
+        self.acquired = True
+        gaps = [np.linalg.norm(columns[-1].T[rings, :3, 3] - chosen[1][-1].T[rings, :3, 3], axis=1).max()
+                for _, columns in tries]
+        return all(gap < AMBIGUOUS or cost > chosen[0] * margin for (cost, _), gap in zip(tries, gaps, strict=True))
+
+    def _refine(self) -> tuple[float, list[Column]]:
+        """Solve the window from where it is: (cost of its measurements, its columns)."""
+        self.acquire()
+        return self._window.measurement_cost(), [self._window.column(k) for k in range(len(self._window.columns))]
+
+
 class ShapeSearch:
     """Beam search over bent shapes for the ones that a snapshot fits."""
 
-    def __init__(self, grid: Grid, tof: TofFactor, settings: RecoverySettings, rest_strain: np.ndarray,
-                 strain_psd: np.ndarray):
-        self.grid, self.settings, self.rest = grid, settings, rest_strain
+    def __init__(self, grid: Grid, tof: TofFactor, settings: RecoverySettings, priors: Priors):
+        self.grid, self.settings, self.rest = grid, settings, priors.rest
         self.options = tof.settings.tof
         self._tof, self._thinned = tof, None
         count = int(round(settings.max_curvature / settings.curvature_step))
         steps = settings.curvature_step * np.arange(-count, count + 1)
         self.curvatures = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
         self.curvatures = self.curvatures[np.hypot(*self.curvatures.T) <= settings.max_curvature + 1e-9]
-        self._bending_psd = float(np.mean(strain_psd[4:]))
+        self._bending_psd = float(np.mean(1.0 / priors.strain[4:]))
 
     @property
     def _map(self) -> tuple:
