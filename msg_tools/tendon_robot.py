@@ -146,7 +146,8 @@ def _read(path: Path) -> _File:
                          f"got {lines[0] if lines else 'an empty file'!r}")
     rows = _numbers(path, lines[2:], 2 + VALUES[kind])
     if np.ptp(rows[:, 1]) > 0.0:
-        raise TrialError(f"{path}: arclengths from {rows[:, 1].min():g} to {rows[:, 1].max():g} m; a file holds one sensor")
+        raise TrialError(f"{path}: arclengths from {rows[:, 1].min():g} to {rows[:, 1].max():g} m; "
+                         "a file holds one sensor")
     stamps = STAMP_OF_ZERO + np.round(rows[:, 0] * 1e9).astype(np.int64)
     if stamps[0] < 0 or np.any(np.diff(stamps) <= 0):
         raise TrialError(f"{path}: time stamps must increase from row to row and begin after "

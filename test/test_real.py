@@ -47,7 +47,8 @@ def trial(tmp_path):
 def test_the_tangent_becomes_body_x_and_motion_keeps_its_meaning(trial):
     """A rate in the imported body frame is what the imported poses turn by: dT/dt = T hat(omega), about the tangent."""
     recording = read_recording(trial, ROBOT)
-    tip = [sample for sample in recording.measurements if isinstance(sample, TrackedPose) and sample.sensor == "tip_tracker"]
+    tip = [sample for sample in recording.measurements
+           if isinstance(sample, TrackedPose) and sample.sensor == "tip_tracker"]
     rate = next(sample for sample in recording.measurements if isinstance(sample, ImuSample))
     np.testing.assert_allclose(tip[0].T_map_sensor[:3, 0], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(rate.angular_velocity, [0.5, 0, 0], atol=1e-12)
@@ -74,7 +75,8 @@ def test_a_bag_gives_back_what_was_imported(trial, tmp_path):
     counts = import_trial(trial, tmp_path / "bag", ROBOT)
     recording = read_recording(trial, ROBOT)
     back = [item for _, item in read_bag(tmp_path / "bag")]
-    assert counts == {"tracker/base_tracker": 52, "tracker/tip_tracker": 52, "imu/data_raw": 104, "ground_truth/poses": 17}
+    assert counts == {"tracker/base_tracker": 52, "tracker/tip_tracker": 52, "imu/data_raw": 104,
+                      "ground_truth/poses": 17}
     for kind, wanted in (("TrackedPose", TrackedPose), ("ImuSample", ImuSample)):
         ours = [s for s in recording.measurements if isinstance(s, wanted)]
         theirs = [s for s in back if isinstance(s, wanted)]
