@@ -8,7 +8,13 @@ from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandle
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import EqualsSubstitution, LaunchConfiguration, NotSubstitution, PathJoinSubstitution
+from launch.substitutions import (
+    EqualsSubstitution,
+    LaunchConfiguration,
+    NotSubstitution,
+    PathJoinSubstitution,
+    PythonExpression,
+)
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -33,11 +39,13 @@ def generate_launch_description():
     arg = LaunchConfiguration
     text = {name: ParameterValue(arg(name), value_type=str) for name in ("robot", "scene", "trajectory", "map", "bag")}
     sim_time = ParameterValue(arg("use_sim_time"), value_type=bool)
+    # The estimator, and the recorder where there is one: the data begins when both listen.
+    listeners = ParameterValue(PythonExpression(["2 if '", arg("bag"), "' else 1"]), value_type=int)
     common = {"package": "continuum_loc", "namespace": arg("namespace"), "output": "screen"}
     simulator = Node(executable="simulator", name="simulator", parameters=[
         {"robot": text["robot"], "scene": text["scene"], "trajectory": text["trajectory"],
-         "duration": ParameterValue(arg("duration"), value_type=float), "use_sim_time": sim_time, "wait_for": 1}],
-        **common)
+         "duration": ParameterValue(arg("duration"), value_type=float), "use_sim_time": sim_time,
+         "wait_for": listeners}], **common)
     estimator = Node(executable="estimator", name="estimator", parameters=[
         ParameterFile(arg("params_file")), {"robot": text["robot"], "map": text["map"], "use_sim_time": sim_time}],
         **common)

@@ -120,14 +120,14 @@ def raw_messages(path: str | Path, topics: tuple[str, ...] | None = None,
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
     """An opened rosbags reader. Raises BagError naming the file."""
-    from rosbags.rosbag2 import Reader, ReaderError
+    from rosbags.rosbag2 import Reader
 
     if not path.exists():
         raise BagError(f"{path}: no such bag; give a bag folder (with metadata.yaml), or an .mcap or .db3 file")
     try:
         reader = Reader(path)
         reader.open()
-    except (ReaderError, OSError, ValueError, KeyError, IndexError, TypeError, EOFError) as error:
+    except Exception as error:  # damaged bytes come out of rosbags as all sorts of errors, MemoryError among them
         raise BagError(f"{path}: not a rosbag2 bag that can be read ({error or type(error).__name__}). Valid: a folder "
                        "with metadata.yaml, or one .mcap or .db3 file, closed by its recorder; `mcap recover` mends "
                        "a file that was cut off") from None
@@ -171,11 +171,9 @@ def _selected(topic: str, topics: tuple[str, ...] | None) -> bool:
 
 
 def _messages(path: Path, reader: Any, connections: list) -> Iterator[tuple[Any, int, bytes]]:
-    from rosbags.rosbag2 import ReaderError
-
     try:
         yield from reader.messages(connections)
-    except (ReaderError, OSError, ValueError, EOFError, IndexError) as error:
+    except Exception as error:  # as in open_bag
         raise BagError(f"{path}: damaged ({error or type(error).__name__}); `mcap recover` may mend it") from None
 
 

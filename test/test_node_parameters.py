@@ -17,7 +17,7 @@ from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes import parameters
 from continuum_loc.nodes.runtime import PackageNode
 from continuum_loc.nodes.settings import EstimatorNodeSettings
-from continuum_loc.nodes.write_config import FILTER_NOTE, NODES, config_text
+from continuum_loc.nodes.write_config import NODES, config_text
 from continuum_loc.settings import SettingsError
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
@@ -105,16 +105,9 @@ def test_changes_at_run_time_are_asked_about():
 def test_the_yaml_of_every_node_is_in_step_with_its_settings(name):
     """Else run `python -m continuum_loc.nodes.write_config config`."""
     text = (CONFIG / f"{name}.yaml").read_text()
-    own = text.split(FILTER_NOTE)[0]
-    assert own == config_text(name).split(FILTER_NOTE)[0]
+    assert text == config_text(name)
     given = yaml.safe_load(text)["/**"]["ros__parameters"]
     assert set(given) == {leaf for leaf, _, _ in parameters.leaves(NODES[name], "")}
     with node_of(NODES[name], "--params-file", str(CONFIG / f"{name}.yaml"), name=name) as node:
         node.check_parameters()
         assert node.settings == NODES[name]
-
-
-def test_the_filter_settings_in_the_yaml_exist():
-    lines = (CONFIG / "estimator.yaml").read_text().split(FILTER_NOTE)[1].splitlines()
-    named = {line.split(":")[0].strip(" #") for line in lines if line.strip().startswith("# filter.")}
-    assert named == {leaf for leaf, _, _ in parameters.leaves(EstimatorSettings(), "filter.")}

@@ -12,7 +12,6 @@ from typing import Any
 
 import yaml
 
-from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes.parameters import constraint, leaves
 from continuum_loc.nodes.settings import (
     EstimatorNodeSettings,
@@ -28,8 +27,10 @@ NODES: dict[str, Settings] = {"simulator": SimulatorNodeSettings(), "estimator":
                               "shape": ShapeNodeSettings(), "recorder": RecorderNodeSettings(),
                               "replayer": ReplayerNodeSettings()}
 FILTER_NOTE = """\
-    # The filter itself. What stands here comes before the settings of `settings`; the numbers shown are the
-    # defaults of the library, not those tuned for a robot, so uncomment only what you mean to change.
+    # Every setting of the filter is a parameter too, named as in continuum_loc/estimator/settings.py, and comes before
+    # those of `settings`; a change while the node runs starts the estimate anew. `ros2 param list /estimator`
+    # names them, `ros2 param describe /estimator filter.tof.gate` explains one.
+    # filter.tof.gate: 0.12
 """
 
 
@@ -39,19 +40,16 @@ def config_text(node: str) -> str:
             f"#   ros2 run continuum_loc {node} --ros-args --params-file {node}.yaml -p name:=value\n"
             "# [live] may change while the node runs (`ros2 param set`); the others are refused then.\n"
             "/**:\n  ros__parameters:\n")
-    body = "".join(_entries(NODES[node], "", ""))
-    if node == "estimator":
-        body += FILTER_NOTE + "".join(_entries(EstimatorSettings(), "filter.", "# "))
-    return head + body
+    return head + "".join(_entries(NODES[node])) + (FILTER_NOTE if node == "estimator" else "")
 
 
-def _entries(settings: Settings, prefix: str, mark: str) -> Iterator[str]:
-    for name, field, value in leaves(settings, prefix):
+def _entries(settings: Settings) -> Iterator[str]:
+    for name, field, value in leaves(settings, ""):
         limits = constraint(field)
-        live = bool((field.json_schema_extra or {}).get("live")) or bool(mark)
+        live = bool((field.json_schema_extra or {}).get("live"))
         notes = [field.description or "", f"({limits})" if limits else "", "[live]" if live else ""]
         yield _comment(" ".join(note for note in notes if note))
-        yield f"    {mark}{name}: {_text(value)}\n"
+        yield f"    {name}: {_text(value)}\n"
 
 
 def _comment(text: str) -> str:
