@@ -32,14 +32,16 @@ setup(
     ],
     python_requires=">=3.11",
     install_requires=[
-        "setuptools", "numpy", "scipy", "numba", "pydantic>=2", "pyyaml", "rosbags>=0.11", "typer", "rich",
-        "mujoco>=3.3", "open3d", "trimesh", "manifold3d", "coacd", "pandas", "pyarrow", "jinja2", "plotly",
+        "setuptools", "numpy", "scipy", "numba", "threadpoolctl", "pydantic>=2", "pyyaml", "rosbags>=0.11", "typer", "rich",
+        "mujoco>=3.3", "open3d", "trimesh", "manifold3d", "coacd", "pandas", "jinja2", "plotly",
         "matplotlib", "pillow",
     ],
     extras_require={
         # Where there is no ROS 2 installation, the same Jazzy packages as wheels.
         "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-common-interfaces==5.3.6"],
         "test": ["pytest", "pytest-timeout", "hypothesis", "evo", "ruff"],
+        "bench": ["kiss-icp", "small_gicp"],
+        "cluster": ["dask", "distributed"],
     },
     zip_safe=False,
     maintainer="continuum_loc maintainers",
