@@ -58,7 +58,7 @@ def worst_part(ranked: Sequence[Outcome]) -> Part:
                  f"{100 * one.summary['translation_max_m']:.2f}", f"{one.summary['rotation_mae_deg']:.2f}",
                  f"{one.summary['estimates']['lost']} of {one.summary['estimates']['all']}"])
             for one in ranked[:WORST_TRIALS]]
-    return Part("Worst trials first", "Each has a run folder under `trials/`; `continuum-loc report` makes its page.",
+    return Part("Worst trials first", "Each has a run folder under trials/; `continuum-loc report` makes its page.",
                 Table(["trial (map, robot, scene, trajectory)", "MAE cm", "max cm", "MAE deg", "said lost"], rows))
 
 
@@ -66,4 +66,6 @@ def as_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Rows of mappings with equal keys as a table of the page."""
     columns = list(rows[0]) if rows else []
     words = [index for index, name in enumerate(columns) if rows and isinstance(rows[0][name], str)]
-    return Table(columns, [Row([str(row[name]) for name in columns]) for row in rows], words)
+    # A mean and its deviation stay on one line.
+    return Table(columns, [Row([str(row[name]).replace(" ± ", "\u00a0±\u00a0") for name in columns]) for row in rows],
+                 words)

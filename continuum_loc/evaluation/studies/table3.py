@@ -43,7 +43,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
                 extra={"quick": quick, "hold_out": HOLD_OUT["soft_arm"],
                        "failed": {outcome.trial.name: outcome.error for outcome in outcomes if outcome.error}})
     write_study_report(out, "Table III: the soft arm", claims,
-                       {f"Errors, sensors `{name}`": tables[f"table3_{name}"] for name in FIDELITIES}, outcomes)
+                       {f"Errors, sensors as {name}": tables[f"table3_{name}"] for name in FIDELITIES}, outcomes)
     return claims
 
 

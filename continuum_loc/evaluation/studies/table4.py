@@ -29,7 +29,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     write_study(out, claims, seed=seed, settings={"trials": [outcome.trial for outcome in outcomes]},
                 tables={**tables, "trials": trial_rows(outcomes)}, extra={"quick": quick})
     write_study_report(out, "Table IV: the soft arm, ring by ring", claims,
-                       {f"Errors, sensors `{name}`": tables[f"table4_{name}"] for name in FIDELITIES}, outcomes)
+                       {f"Errors, sensors as {name}": tables[f"table4_{name}"] for name in FIDELITIES}, outcomes)
     return claims
 
 
