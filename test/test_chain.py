@@ -40,6 +40,8 @@ def test_solution_and_covariances_equal_dense_algebra(seed):
     for k in range(K - 1):
         chosen = np.concatenate([D * k + rows, D * (k + 1) + rows])
         np.testing.assert_allclose(chain.joint_covariance(k, rows), P[np.ix_(chosen, chosen)], atol=1e-9)
+        alone = chain.joint_covariance(k, rows, with_next=False)
+        np.testing.assert_allclose(alone, P[np.ix_(D * k + rows, D * k + rows)], atol=1e-9)
 
 
 def test_marginalising_equals_the_batch_solution():

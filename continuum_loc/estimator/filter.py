@@ -70,7 +70,7 @@ class SlidingWindowFilter:
             return None
         from continuum_loc.mapping.voxel_index import VoxelIndex
 
-        index = VoxelIndex(prior_map.points, prior_map.normals)
+        index = VoxelIndex(prior_map.points, prior_map.normals, reach=self.settings.tof.gate)
         return TofFactor(self.robot, self.grid, self.settings, prior_map, index)
 
     # ------------------------------------------------------------------ measurements in, estimates out
@@ -90,7 +90,7 @@ class SlidingWindowFilter:
     def query(self, stamp: int, s: float) -> BodyState:
         """Mean and covariance of pose, strain and velocity at a stamp [ns] and arclength s [m].
 
-        Inside the window, behind it as far as `history` reaches (smoothed by what followed within the window), and
+        Inside the window, behind it as far as `history` reaches (smoothed by the knots that followed), and
         ahead of it at constant body-frame velocity, with a covariance that grows. Raises ValueError beyond these.
         """
         if self.epoch is None or not self.window.intervals:

@@ -82,9 +82,8 @@ def _interpolate(T_a, v_a, T_b, v_b, d, tau, from_a, from_b, T, v, J_pose, J_rat
 
 def backbone(grid: Grid, T: np.ndarray, strain: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Poses (B, 4, 4) at arclengths s (B,) of a body with nodes T (N, 4, 4) and strain (N, 6)."""
-    segments = [grid.segment(x) for x in s]
     out = np.empty((len(s), 4, 4))
-    _backbone(T, strain, grid.s, np.array([n for n, _ in segments]), np.array([offset for _, offset in segments]), out)
+    _backbone(T, strain, grid.s, *grid.segments(s), out)
     return out
 
 

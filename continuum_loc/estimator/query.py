@@ -13,10 +13,12 @@ from continuum_loc.estimator.output import BodyState, body_between
 from continuum_loc.estimator.state import NODE_DIM, POSE, STRAIN, VELOCITY, Column, Grid
 from continuum_loc.estimator.window import TIME_EPSILON, Window
 
+SMOOTHED_BY = 3  # knots
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PastColumn:
-    """A column that is about to leave the window, with each neighbouring pair of nodes' covariance (N - 1, 36, 36)."""
+    """A column of the past, with each neighbouring pair of nodes' covariance (N - 1, 36, 36)."""
 
     column: Column
     covariance: np.ndarray
@@ -30,14 +32,16 @@ class History:
         self._columns: deque[PastColumn] = deque()
 
     def note(self, window: Window) -> None:
-        """Keep the oldest column of the window as it is now, smoothed by all that the window knows."""
-        column = window.column(0)
-        if self._duration <= 0.0 or len(window.intervals) < 2:
+        """Keep a column once `SMOOTHED_BY` later ones have smoothed it; more of them would change it little and cost
+        much."""
+        k = len(window.columns) - 1 - SMOOTHED_BY
+        if self._duration <= 0.0 or k < 0:
             return
+        column = window.column(k)
         if self._columns and column.time < self._columns[-1].column.time + TIME_EPSILON:
             return
         rows = np.arange(NODE_DIM * window.grid.nodes)
-        P = window.chain.joint_covariance(0, rows)
+        P = window.chain.joint_covariance(k, rows, with_next=False)
         pairs = [slice(NODE_DIM * n, NODE_DIM * (n + 2)) for n in range(window.grid.nodes - 1)]
         self._columns.append(PastColumn(column, np.array([P[pair, pair] for pair in pairs])))
         while self._columns[0].column.time < column.time - self._duration:

@@ -198,7 +198,7 @@ class ShapeSearch:
     def _map(self) -> tuple:
         """The thinned map, made at the first search."""
         if self._thinned is None:
-            self._thinned = thinned(self._tof, COARSE_SPACING)
+            self._thinned = thinned(self._tof, COARSE_SPACING, self.settings.score_gate)
         return self._thinned
 
     def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
@@ -250,7 +250,7 @@ class ShapeSearch:
         return strain
 
 
-def thinned(tof: TofFactor, spacing: float) -> tuple:
+def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
     """The map's arrays for the kernels with one point for each cell of `spacing` and each octant of the normal, so that
     both sides of a thin blade stay."""
     from continuum_loc.mapping.voxel_index import VoxelIndex
@@ -261,7 +261,7 @@ def thinned(tof: TofFactor, spacing: float) -> tuple:
     keys = np.ravel_multi_index((*cells.T, octants), (*(cells.max(axis=0) + 1), 8))
     order = np.argsort(keys, kind="stable")
     kept = order[np.flatnonzero(np.diff(keys[order], prepend=-1))]
-    index = VoxelIndex(points[kept], normals[kept])
+    index = VoxelIndex(points[kept], normals[kept], reach=reach)
     return index.arrays, *(np.ascontiguousarray(x[kept]) for x in (points, normals, planarity)), variance
 
 

@@ -43,10 +43,15 @@ class Grid:
         """The node at arclength s [m]; every ring has one."""
         return int(np.argmin(np.abs(self.s - s)))
 
+    def segments(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nodes (m,) below arclengths s (m,) and the distances (m,) from them [m]; s is clipped to the body."""
+        n = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, self.nodes - 2)
+        return n, np.clip(s, self.s[0], self.s[-1]) - self.s[n]
+
     def segment(self, s: float) -> tuple[int, float]:
-        """The node below s and the distance from it [m]; s is clipped to the body."""
-        n = int(np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, self.nodes - 2))
-        return n, float(np.clip(s, self.s[0], self.s[-1]) - self.s[n])
+        """`segments` of one arclength."""
+        n, offset = self.segments(np.array([s]))
+        return int(n[0]), float(offset[0])
 
 
 @dataclass(slots=True, eq=False)

@@ -604,7 +604,7 @@ def _suitable_voxel(points: np.ndarray) -> float:
     smallest = extent / (AXIS_LIMIT // 2)
     voxel = max(extent * np.sqrt(POINTS_PER_VOXEL / len(points)), smallest)
     for _ in range(4):  # occupancy grows as the square of the edge
-        occupied = len(np.unique(_morton_codes(points, origin, 1.0 / voxel)))
+        occupied = 1 + np.count_nonzero(np.diff(np.sort(_morton_codes(points, origin, 1.0 / voxel))))
         voxel = max(voxel * np.sqrt(POINTS_PER_VOXEL * occupied / len(points)), smallest)
         if voxel >= extent:
             return extent

@@ -52,10 +52,9 @@ class StrainFactor(Factor):
         stations, station = rows[0][0], np.tile(np.arange(len(rows[0][0])), len(rows))
         if len(s) != len(station) or not np.array_equal(s, stations[station]):  # not the same stations every time
             stations, station = np.unique(s, return_inverse=True)
-        segments = [self.grid.segment(x) for x in stations]
         return (np.repeat(times, [len(row[0]) for row in rows]), station.astype(np.int64),
                 np.concatenate([row[1] for row in rows]), np.concatenate([row[2] for row in rows]),
-                np.array([n for n, _ in segments]), np.array([offset for _, offset in segments]))
+                *self.grid.segments(stations))
 
     def linearise(self, batch, a, b, blocks):
         cost, squared = _add(blocks.H, blocks.g, a.T, a.strain, b.T, b.strain, b.time - a.time, self.grid.s, *batch,

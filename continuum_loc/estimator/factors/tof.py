@@ -14,7 +14,7 @@ from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, Repeats, known_sensor
 from continuum_loc.estimator.state import VELOCITY
-from continuum_loc.mapping.voxel_index import nearest_facing
+from continuum_loc.mapping.voxel_index import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 
 MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
@@ -124,26 +124,29 @@ def frame_information(T, q, rays, variance, weight, arrays, cloud, normals, plan
     H[:, :] = 0.0
     g[:] = 0.0
     cost, squared, count = 0.0, 0.0, 0
-    row = np.empty(6)
+    zones, row = q.shape[0], np.empty(6)
     c2 = cauchy * cauchy
+    points, directions = np.empty((zones, 3)), np.empty((zones, 3))
+    hits, distance2 = np.empty(zones, np.int64), np.empty(zones)
+    for z in range(zones):
+        for i in range(3):
+            nowhere = not np.isfinite(variance[z])  # a query of nan matches nothing
+            points[z, i] = np.nan if nowhere else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
+            directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
+    nearest_facing_batch(arrays, normals, points, directions, gate, min_cosine, hits, distance2)
     fit[0] = 0.0
     fit[1] = 0.0
-    for z in range(q.shape[0]):
+    for z in range(zones):
         if not np.isfinite(variance[z]):
             continue
         fit[0] += 1.0
-        a, b, c = q[z, 0], q[z, 1], q[z, 2]
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        w = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-        d, e, f = rays[z, 0], rays[z, 1], rays[z, 2]
-        dx = T[0, 0] * d + T[0, 1] * e + T[0, 2] * f
-        dy = T[1, 0] * d + T[1, 1] * e + T[1, 2] * f
-        dz = T[2, 0] * d + T[2, 1] * e + T[2, 2] * f
-        hit, _ = nearest_facing(arrays, normals, x, y, w, dx, dy, dz, gate, min_cosine)
+        hit = hits[z]
         if hit < 0:
             cost += 0.5 * weight * c2 * np.log1p(gate * gate / (c2 * (variance[z] + floor2)))
             continue
+        a, b, c = q[z, 0], q[z, 1], q[z, 2]
+        x, y, w = points[z, 0], points[z, 1], points[z, 2]
+        dx, dy, dz = directions[z, 0], directions[z, 1], directions[z, 2]
         nx, ny, nz = normals[hit, 0], normals[hit, 1], normals[hit, 2]
         r = nx * (x - cloud[hit, 0]) + ny * (y - cloud[hit, 1]) + nz * (w - cloud[hit, 2])
         cosine = nx * dx + ny * dy + nz * dz
