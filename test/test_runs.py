@@ -102,6 +102,14 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
         new_run("replay", tmp_path)
 
 
+def test_a_damaged_result_is_named(result, tmp_path):
+    folder = new_run("replay", tmp_path)
+    save_run(folder, result, kind="replay", seed=0, configuration={})
+    (folder / "result.npz").write_bytes(b"not a result")
+    with pytest.raises(RunError, match=r"result\.npz: damaged"):
+        load_run(folder)
+
+
 def test_without_truth_or_estimates_figures_are_unknown_and_not_zero():
     nothing = replay([], NoisyFilter(ROBOT))
     assert np.isnan(summary_of(nothing)["translation_mae_m"])

@@ -124,9 +124,11 @@ def demo_claims(result: ReplayResult, lost: dict[str, int], identical: bool) -> 
     """The bounds that a live run has to keep."""
     found = summarise(errors(result.track, result.truth))
     latency = distribution(1e3 * result.latency_seconds)
+    dropped = sum(sum(result.counts[node]["dropped"].values()) for node in ("estimator", "filter"))
     return [at_most("translation MAE", 100 * found["translation_mae_m"], "cm", 0.4),
             at_most("rotation MAE", found["rotation_mae_deg"], "deg", 0.5),
             at_most("live latency p95", latency["p95"], "ms", 66.0),
             at_most("messages lost on the way", sum(lost.values()), "", 0),
+            at_most("messages dropped by the estimator", dropped, "", 0),
             at_least("replay real-time factor", result.real_time_factor, "", 2.0),
             at_least("replays identical", float(identical), "", 1.0)]

@@ -15,7 +15,7 @@ from continuum_loc.measurements import NANOSECONDS
 from continuum_loc.robot import RobotDescription
 from continuum_loc.simulator.render import Camera, Shape, render, robot_shapes
 
-PANEL = (560, 420)
+PANEL = (560, 380)
 FRAMES, FRAME_MS = 40, 120
 MAP_POINTS, CLOUD_POINTS, REACH = 25_000, 900, 0.45
 MESH, MAP, CLOUD = (0.62, 0.70, 0.78), (0.62, 0.69, 0.77), (0.02, 0.62, 0.58)
@@ -100,7 +100,7 @@ def _camera(low: np.ndarray, high: np.ndarray) -> Camera:
     before the body is cut away."""
     middle, size = 0.5 * (low + high), np.maximum(high - low, 0.2)
     width, height = PANEL
-    distance = 0.68 * max(size[0], size[2] * width / height) / np.tan(np.radians(25.0))
+    distance = 0.6 * max(size[0], size[2] * width / height) / np.tan(np.radians(25.0))
     eye = middle + distance * np.array([-0.25, -1.0, 0.25])
     return Camera(tuple(eye), tuple(middle), fov_deg=50.0, width=width, height=height, section=low[1] - 0.05)
 

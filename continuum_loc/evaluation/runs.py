@@ -125,8 +125,12 @@ def load_run(folder: str | Path) -> Run:
     for name in ("summary.json", "configuration.yaml", "result.npz"):
         if not (folder / name).is_file():
             raise RunError(f"{folder} is no run folder: it has no {name}")
+    try:
+        result = _load_result(folder / "result.npz")
+    except (KeyError, ValueError, OSError) as error:
+        raise RunError(f"{folder / 'result.npz'}: damaged, or of another version of this package ({error})") from None
     return Run(folder.resolve(), json.loads((folder / "summary.json").read_text()),
-               yaml.safe_load((folder / "configuration.yaml").read_text()), _load_result(folder / "result.npz"))
+               yaml.safe_load((folder / "configuration.yaml").read_text()), result)
 
 
 def _save_result(path: Path, result: ReplayResult) -> None:
