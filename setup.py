@@ -5,7 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "continuum_loc"
-NODES = ("simulator", "estimator", "shape", "recorder", "replayer")
+NODES = ("simulator", "estimator", "shape", "recorder", "replayer", "viewer")
 HERE = Path(__file__).parent
 
 
@@ -32,8 +32,8 @@ setup(
     ],
     python_requires=">=3.11",
     install_requires=[
-        "setuptools", "numpy", "scipy", "numba", "threadpoolctl", "pydantic>=2", "pyyaml", "rosbags>=0.11", "typer", "rich",
-        "mujoco>=3.3", "open3d", "trimesh", "manifold3d", "coacd", "pandas", "jinja2", "plotly",
+        "setuptools", "numpy", "scipy", "numba", "threadpoolctl", "pydantic>=2", "pyyaml", "rosbags>=0.11", "typer",
+        "rich", "mujoco>=3.3", "open3d", "trimesh", "manifold3d", "coacd", "pandas", "jinja2", "plotly",
         "matplotlib", "pillow",
     ],
     extras_require={

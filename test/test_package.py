@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ROS = ("rclpy", "rcl_interfaces", "sensor_msgs", "geometry_msgs", "nav_msgs", "std_msgs", "std_srvs", "diagnostic_msgs",
        "builtin_interfaces", "rosgraph_msgs", "tf2_msgs", "tf2_ros", "launch", "launch_ros")
 HEAVY = ("open3d", "mujoco", "trimesh", "matplotlib", "plotly", "pandas", "rosbags")
-NODES = ("simulator", "estimator", "shape", "recorder", "replayer")
+NODES = ("simulator", "estimator", "shape", "recorder", "replayer", "viewer")
 
 
 def _modules(skip=("nodes",)):

@@ -108,3 +108,12 @@ class ReplayerNodeSettings(Settings):
     clock_rate: float = Field(100.0, gt=0.0, le=1000.0, description="/clock messages per second of data [Hz]")
     wait_for: int = Field(0, ge=0, description="start when this many subscriptions listen to the sensors")
     wait_timeout: float = Field(60.0, gt=0.0, description="give up waiting after this time [s]")
+
+
+class ViewerNodeSettings(Settings):
+    """Node `viewer`."""
+
+    host: str = Field("127.0.0.1", description="address to serve on; 0.0.0.0 lets other machines watch")
+    port: int = Field(8765, ge=0, le=65535, description="port to serve on; 0 takes a free one")
+    map_points: int = Field(20_000, ge=0, description="most map points that are sent to the browser")
+    cloud_points: int = Field(5_000, ge=0, description="most reconstructed points that are sent to the browser")

@@ -19,13 +19,14 @@ from continuum_loc.nodes.settings import (
     ReplayerNodeSettings,
     ShapeNodeSettings,
     SimulatorNodeSettings,
+    ViewerNodeSettings,
 )
 from continuum_loc.settings import Settings
 
 WIDTH = 112
 NODES: dict[str, Settings] = {"simulator": SimulatorNodeSettings(), "estimator": EstimatorNodeSettings(),
                               "shape": ShapeNodeSettings(), "recorder": RecorderNodeSettings(),
-                              "replayer": ReplayerNodeSettings()}
+                              "replayer": ReplayerNodeSettings(), "viewer": ViewerNodeSettings()}
 FILTER_NOTE = """\
     # Every setting of the filter is a parameter too, named as in continuum_loc/estimator/settings.py, and comes before
     # those of `settings`; a change while the node runs starts the estimate anew. `ros2 param list /estimator`
