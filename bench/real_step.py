@@ -26,11 +26,12 @@ def run(quick: bool = False) -> list[dict]:
 
     robot = load_robot(ROBOT)
     recording = read_recording(data_folder() / "impulse_2", robot)
-    estimator = SlidingWindowFilter(robot, None, load_estimator_settings(ROBOT))
+    settings = load_estimator_settings(ROBOT)
+    estimator = SlidingWindowFilter(robot, None, settings)
+    size = estimator.grid.nodes, 1 + round(settings.window / settings.knot_period)
+    if size != (NODES, KNOTS):
+        raise ValueError(f"the window has {size[0]} nodes and {size[1]} knots; the figures are for {NODES} and {KNOTS}")
     estimates(recording, estimator, (7.0, 7.5))  # compiles, and fills the window
-    if (estimator.grid.nodes, len(estimator.columns)) != (NODES, KNOTS):
-        raise ValueError(f"the window has {estimator.grid.nodes} nodes and {len(estimator.columns)} knots, and the "
-                         f"figures are for {NODES} and {KNOTS}")
     *_, step_ms = estimates(recording, estimator, (7.5, 9.0 if quick else 18.0))
     return [{"name": "real trial, step", "ours_s": 1e-3 * float(np.median(step_ms)),
              "p95_s": 1e-3 * float(np.percentile(step_ms, 95)), "peer": None, "peer_s": None, "ratio": None,
