@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from continuum_loc.measurements import (
+    NANOSECONDS,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -35,9 +36,13 @@ SACRIFICE = ("tof/points", "strain", "imu/mag", TRACKER, "joint_states", "imu/da
 
 
 class Queued(NamedTuple):
-    """A message as it arrived: order of arrival, topic, message, ROS time (ns) and monotonic time (s) of arrival."""
+    """A message as it arrived: its place, topic, message, ROS time (ns) and monotonic time (s) of arrival.
 
-    order: int
+    place: stamp (ns), or the arrival where that is earlier, as stamps from the future must not hold up others; then the
+    order of arrival.
+    """
+
+    place: tuple[int, int]
     topic: str
     message: Any
     arrival: int
@@ -45,7 +50,11 @@ class Queued(NamedTuple):
 
 
 class Inbox:
-    """The queue between reception (one thread puts) and estimation (one thread takes), in the order of arrival."""
+    """The queue between reception (one thread puts) and estimation (one thread takes).
+
+    Each topic keeps its order of arrival; topics are merged by stamp, because reception takes them one after the other,
+    and a backlog would otherwise tear them apart.
+    """
 
     def __init__(self, settings: IntakeSettings) -> None:
         self.settings = settings
@@ -64,14 +73,15 @@ class Inbox:
         kind = TRACKER if topic.startswith(TRACKER) else topic
         with self._ready:
             self.received[topic] += 1
-            self._queues[kind].append(Queued(self._order, topic, message, arrival, time.monotonic()))
+            place = (min(rough_stamp(message, arrival), arrival), self._order)
+            self._queues[kind].append(Queued(place, topic, message, arrival, time.monotonic()))
             self._order += 1
             self._size += 1
             self._relieve()
             self._ready.notify()
 
     def take(self, timeout: float) -> Queued | None:
-        """The oldest message, or None when none came within `timeout` seconds."""
+        """The message whose turn it is, or None when none came within `timeout` seconds."""
         with self._ready:
             if self._size == 0:
                 self._ready.wait(timeout)
@@ -79,7 +89,7 @@ class Inbox:
             if not heads:
                 return None
             self._size -= 1
-            return min(heads, key=lambda queue: queue[0].order).popleft()
+            return min(heads, key=lambda queue: queue[0].place).popleft()
 
     def clear(self) -> None:
         """Forget everything queued."""
@@ -99,6 +109,17 @@ class Inbox:
         self._queues[kind].popleft()
         self._size -= 1
         self.dropped[kind] += 1
+
+
+def rough_stamp(message: Any, arrival: int) -> int:
+    """The stamp (ns) of a message that was not checked yet: good enough to sort by."""
+    header = getattr(message, "header", None)
+    if header is not None:
+        return header.stamp.sec * NANOSECONDS + header.stamp.nanosec
+    data = getattr(message, "data", None)
+    if data is not None and strain_is_stamped(message) and len(data) and np.isfinite(data[0]):
+        return nanoseconds(data[0])
+    return arrival
 
 
 class StampGate:
