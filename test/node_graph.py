@@ -153,13 +153,14 @@ class Client:
 
 
 class BoxRobot:
-    """Samples of a straight, resting robot in a box, whose distances are exact, so that the right estimate is known."""
+    """Samples of a straight, resting robot in a box, whose distances are known, and so the right estimate."""
 
     def __init__(self, folder: Path) -> None:
         self.path, self.map = folder / "stub.yaml", folder / "box.csv"
         self.path.write_text(ROBOT)
         self.robot = load_robot(self.path)
         self._write_map()
+        self._rng = np.random.default_rng(0)  # a sensor that repeats itself to the last bit counts as frozen
         self.T_map_ring = np.tile(np.eye(4), (3, 1, 1))
         self.T_map_ring[1:, 0, 3] = self.robot.ring_arclengths
 
@@ -168,13 +169,13 @@ class BoxRobot:
         for sensor in self.robot.tof:
             yield "tof/points", self.frame(sensor, stamp)
         for sensor in self.robot.imu:
-            yield "imu/data_raw", ImuSample(stamp, sensor.name, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+            yield "imu/data_raw", ImuSample(stamp, sensor.name, 1e-3 * self._rng.normal(size=3), np.array([0, 0, 9.81]))
         s = self.robot.strain_stations
         yield "strain", StrainSample(stamp, s, 0 * s, 0 * s)
         yield "joint_states", EncoderSample(stamp, ("insertion",), np.zeros(1), np.zeros(1))
 
     def frame(self, sensor, stamp: int) -> TofFrame:
-        """The exact distances to the box."""
+        """The distances to the box, to half a millimetre."""
         ring = 1 + self.robot.ring_names.index(sensor.ring)
         T = self.T_map_ring[ring] @ sensor.mount.T_ring_sensor
         rays = self.robot.tof_model.directions
@@ -182,6 +183,7 @@ class BoxRobot:
         with np.errstate(divide="ignore", invalid="ignore"):
             walls = np.where(directions > 0.0, (BOX[1] - T[:3, 3]) / directions, (BOX[0] - T[:3, 3]) / directions)
         ranges = np.nanmin(np.where(directions == 0.0, np.inf, walls), axis=1)
+        ranges = ranges + 5e-4 * self._rng.normal(size=len(ranges))
         return TofFrame(stamp, sensor.name, ranges[:, None] * rays, ranges, self.robot.tof_model.sigma(ranges),
                         np.full(len(rays), 5, np.uint8))
 
