@@ -37,7 +37,7 @@ from continuum_loc.simulator.faults import Dropout, Freeze
 flags = st.lists(st.booleans(), min_size=1, max_size=40).map(np.array)
 
 
-def made_up(error, status, accused=None, heard=None, case=None) -> CaseResult:
+def made_up(error, status, accused=None, shares=None, case=None) -> CaseResult:
     """A case of steps at 10 Hz whose rings are off by `error` (K, R) [m]."""
     error = np.asarray(error, float)
     count, rings = error.shape
@@ -46,7 +46,7 @@ def made_up(error, status, accused=None, heard=None, case=None) -> CaseResult:
     found = Errors((times * NANOSECONDS).astype(np.int64), ("base", *(f"ring{k + 1}" for k in range(rings))),
                    translation, translation, *(np.zeros((count, rings + 1, 6)),) * 2, translation)
     return CaseResult(case or Case("made up", Trial()), object(), "", times, np.broadcast_to(status, count), found,
-                      times, accused or [[]] * count, heard or [[]] * count)
+                      times, accused or [[]] * count, shares or [{}] * count)
 
 
 # ------------------------------------------------------------------ times
@@ -193,10 +193,13 @@ def test_drift_is_the_growth_of_the_error_along_the_body():
     assert ratios == pytest.approx([10.0, 10.0])
 
 
-def fault_case(error, **diagnosis) -> dict:
+EVERYONE = {"ring4_tof2": 0.95, "tip_tof": 0.9, "ring1_imu": 1.0}
+
+
+def fault_case(error, clean_accused=None, **diagnosis) -> dict:
     """The row of a stuck `ring4_tof2` from 1 s to 3 s, beside a clean run that is off by 1 mm."""
     fault = Freeze(sensors=("ring4_tof2",), start=1.0, end=3.0)
-    clean = made_up(np.full((60, 5), 0.001), "tracking")
+    clean = made_up(np.full((60, 5), 0.001), "tracking", accused=clean_accused, shares=[EVERYONE] * 60)
     stuck = made_up(error, "tracking", case=Case("stuck", Trial(), faults=(fault,)), **diagnosis)
     return faults.fault_row(stuck, clean)
 
@@ -212,16 +215,25 @@ def test_back_to_normal_is_timed_from_the_fault_s_end():
 
 
 def test_a_culprit_is_named_as_a_suspect_or_by_its_silence_and_only_in_time():
-    error, everyone = np.full((60, 5), 0.001), ["ring4_tof2", "tip_tof"]
-    suspected = [["ring4_tof2"] if 15 <= k < 20 else [] for k in range(60)]
-    row = fault_case(error, accused=suspected, heard=[everyone] * 60)
+    error, heard = np.full((60, 5), 0.001), [EVERYONE] * 60
+    row = fault_case(error, accused=[["ring4_tof2"] if 15 <= k < 20 else [] for k in range(60)], shares=heard)
     assert (row["named"], row["named after [s]"], row["accused"]) == (1.0, pytest.approx(0.5), 0)
-    silent = fault_case(error, heard=[["tip_tof"] if 20 <= k < 30 else everyone for k in range(60)])
+    silent = fault_case(error, shares=[{"tip_tof": 0.9} if 20 <= k < 30 else EVERYONE for k in range(60)])
     assert (silent["named"], silent["named after [s]"]) == (1.0, pytest.approx(1.0))
-    too_late = [["ring4_tof2"] if k > 45 else [] for k in range(60)]
-    assert fault_case(error, accused=too_late, heard=[everyone] * 60)["named"] == 0.0
-    wrong = fault_case(error, accused=[["tip_tof"]] * 60, heard=[everyone] * 60)
+    late = fault_case(error, accused=[["ring4_tof2"] if k > 45 else [] for k in range(60)], shares=heard)
+    assert (late["named"], late["named after [s]"]) == (0.0, np.inf)
+    wrong = fault_case(error, accused=[["tip_tof"]] * 60, shares=heard)
     assert (wrong["named"], wrong["accused"], wrong["whom"]) == (0.0, 1, "tip_tof")
+
+
+def test_who_is_accused_without_the_fault_is_no_finding():
+    """Neither to the diagnosis' credit, where it is the culprit, nor charged to the fault, where it is another."""
+    blamed = [["ring4_tof2", "tip_tof"]] * 60
+    row = fault_case(np.full((60, 5), 0.001), clean_accused=blamed, accused=blamed, shares=[EVERYONE] * 60)
+    assert (row["named"], row["accused"]) == (0.0, 0)
+    assert faults.clean_row(made_up(np.zeros((60, 5)), "tracking", accused=blamed, shares=[EVERYONE] * 60)) == {
+        "trajectory": "t1", "accused": 2, "whom": "ring4_tof2, tip_tof", "least share, tof": 0.9,
+        "least share, imu": 1.0}
 
 
 def noisy_errors(overconfidence: float = 1.0) -> Errors:
@@ -281,13 +293,13 @@ def watched(room, fault=None) -> tuple[CaseResult, Witness]:
     times = (found.stamps - result.truth.stamps[0]) / NANOSECONDS
     steps = np.array([(entry["stamp"] - result.truth.stamps[0]) / NANOSECONDS for entry in witness.log])
     return CaseResult(case, object(), "", times, result.track.status[:len(times)], found, steps,
-                      [entry["accused"] for entry in witness.log], [entry["heard"] for entry in witness.log]), witness
+                      [entry["accused"] for entry in witness.log], [entry["shares"] for entry in witness.log]), witness
 
 
 def test_a_healthy_robot_accuses_nobody_and_hears_everybody(room):
     result, witness = watched(room)
     assert not any(result.accused)
-    assert set(result.heard[-1]) >= {sensor.name for sensor in rod().tof}
+    assert set(result.shares[-1]) >= {sensor.name for sensor in rod().tof}
     json.dumps(witness.log)
 
 
@@ -301,6 +313,6 @@ def test_a_turned_sensor_is_named_alone_and_the_body_stays(room):
 def test_a_silent_ring_is_missed_and_the_body_is_back_within_a_second(room):
     fault = Dropout(sensors=("r1_*",), start=1.0, end=3.0)
     result, _ = watched(room, fault)
-    assert {sensor.name for sensor in rod().tof if sensor.ring == "r1"} <= {
-        name for step in faults.noticed(result, fault) for name in set(result.heard[0]) - set(result.heard[step])}
+    assert all(faults.named_at(result, fault, name) < 2.0 for name in ("r1_tof0", "r1_tof1", "r1_tof2", "r1_imu"))
+    assert faults.named_at(result, fault, "r2_tof0") == np.inf
     assert settled_since(result.times, result.worst_ring < 0.005) < 4.0

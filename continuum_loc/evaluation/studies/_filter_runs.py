@@ -57,8 +57,8 @@ class Case:
 class CaseResult:
     """What became of a case. Without a run, `error` says why; the arrays are over the steps where truth is known.
 
-    times: (K,) s since the filter's first sample. status: (K,). found: errors. accused, heard: names of the sensors
-    that the filter suspects and that its window holds something of, for every step of `steps` (S,) s.
+    times: (K,) s since the filter's first sample. status: (K,). found: errors. For every step of `steps` (S,) s,
+    accused: names of the sensors that the filter suspects; shares: of samples that fit, by sensor that it has heard.
     """
 
     case: Case
@@ -69,7 +69,7 @@ class CaseResult:
     found: Errors | None = None
     steps: np.ndarray = field(default_factory=lambda: np.empty(0))
     accused: list[list[str]] = field(default_factory=list)
-    heard: list[list[str]] = field(default_factory=list)
+    shares: list[dict[str, float]] = field(default_factory=list)
 
     @property
     def worst_ring(self) -> np.ndarray:
@@ -100,7 +100,7 @@ class Witness:
     def _note(self, estimate: Estimate | None) -> Estimate | None:
         if estimate is not None:
             self.log.append({"stamp": estimate.stamp, "accused": list(estimate.suspects),
-                             "heard": sorted(estimate.inliers)})
+                             "shares": dict(estimate.inliers)})
         return estimate
 
 
@@ -184,7 +184,7 @@ def load_case(out: Path, case: Case, error: str = "") -> CaseResult:
     log = json.loads((folder / "diagnostics.json").read_text())
     return CaseResult(case, run, "", (found.stamps - epoch) / NANOSECONDS, associate(track, truth)[0].status, found,
                       np.array([(entry["stamp"] - epoch) / NANOSECONDS for entry in log]),
-                      [entry["accused"] for entry in log], [entry["heard"] for entry in log])
+                      [entry["accused"] for entry in log], [entry["shares"] for entry in log])
 
 
 def longest_unannounced(result: CaseResult) -> float:

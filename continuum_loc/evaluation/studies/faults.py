@@ -83,8 +83,10 @@ TEXT = """
 Each fault lasts 2 s. *During* is the largest error of any ring while it lasts, beside the same trial without it;
 *back after* the time after its end from which on no ring is farther off than normal (a quarter above the clean run's
 largest error). *Named* is the share of the culprits that the diagnostics name while the fault lasts or within a second
-of its end: a sensor is named when it is among `suspects`, or when it is missing from `inliers`, the list of sensors
-that the window has heard of. *Accused* are other sensors among the suspects.
+of its end: a sensor is named when it is among `suspects`, or when it is missing from `inliers`, the shares of fitting
+samples of the sensors that the window has heard. *Accused* are other sensors among the suspects. Whom the clean run
+names over the same time does not count for either; that has a table and a claim of its own, beside the least share
+of fitting samples of each kind of sensor.
 """.strip()
 
 
@@ -97,11 +99,11 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     rows = [fault_row(result, clean[result.case.trial]) for result in results
             if result.run and clean[result.case.trial].run and result.case.name != CLEAN]
     claims = judge(rows, len(failures(results)))
-    claims.append(at_most("clean runs: sensors accused", sum(
-        len(set().union(*result.accused)) for result in clean.values() if result.run), "", 0))
-    write_study(out, claims, seed=seed, settings={"cases": cases}, tables={"faults": rows},
+    healthy = [clean_row(result) for result in clean.values() if result.run]
+    claims.append(at_most("clean runs: sensors accused", sum(row["accused"] for row in healthy), "", 0))
+    write_study(out, claims, seed=seed, settings={"cases": cases}, tables={"faults": rows, "no_fault": healthy},
                 extra={"quick": quick, "failed": failures(results)})
-    write_page(out, "Faults", TEXT, claims, {"By fault and trial": rows})
+    write_page(out, "Faults", TEXT, claims, {"By fault and trial": rows, "Without a fault": healthy})
     return claims
 
 
@@ -119,20 +121,34 @@ def fault_cases(quick: bool, seed: int) -> list[Case]:
 def fault_row(result: CaseResult, clean: CaseResult) -> dict[str, Any]:
     """What a fault did."""
     fault = result.case.faults[0]
-    culprits = struck(fault)
-    names = named(result, fault)
+    normal = NORMAL_MARGIN * float(clean.worst_ring[clean.times >= fault.start].max())
     during = (result.times >= fault.start) & (result.times < fault.end)
-    same = clean.times >= fault.start
-    normal = NORMAL_MARGIN * float(clean.worst_ring[same].max())
     after = result.times >= fault.end
     back = settled_since(result.times[after], result.worst_ring[after] <= normal) - fault.end
-    blamed = accused(result, fault)
     return {"fault": result.case.name, "trajectory": result.case.trial.trajectory,
             "normal [cm]": 100.0 * normal, "during [cm]": 100.0 * float(result.worst_ring[during].max()),
             "back after [s]": max(back, 0.0), "lost [%]": 100.0 * float(np.mean(result.status[during] == "lost")),
-            "named": len(culprits & names) / len(culprits), "named after [s]": named_after(result, fault, culprits),
-            "accused": len(blamed - culprits), "all struck": result.case.faults[0].sensors == EVERYBODY,
-            "whom": ", ".join(sorted(blamed - culprits)) or "-"}
+            **diagnosis(result, clean), "all struck": fault.sensors == EVERYBODY}
+
+
+def diagnosis(result: CaseResult, clean: CaseResult) -> dict[str, Any]:
+    """Whom the filter names, and when, beyond those that it names without the fault too."""
+    fault = result.case.faults[0]
+    culprits = struck(fault)
+    times = {name: named_at(result, fault, name) for name in culprits if np.isinf(named_at(clean, fault, name))}
+    others = accused(result, fault) - culprits - accused(clean, fault)
+    return {"named": sum(np.isfinite(time) for time in times.values()) / len(culprits),
+            "named after [s]": max(times.values(), default=np.inf), "accused": len(others),
+            "whom": ", ".join(sorted(others)) or "-"}
+
+
+def clean_row(result: CaseResult) -> dict[str, Any]:
+    """A run without a fault: who is accused in it, and how well the worst sensor of each kind fits."""
+    blamed = set().union(*result.accused)
+    least = {kind: min(share for shares in result.shares for name, share in shares.items() if kind in name)
+             for kind in ("tof", "imu")}
+    return {"trajectory": result.case.trial.trajectory, "accused": len(blamed),
+            "whom": ", ".join(sorted(blamed)) or "-", **{f"least share, {kind}": share for kind, share in least.items()}}
 
 
 def judge(rows: Sequence[dict[str, Any]], failed: int) -> list[Claim]:
@@ -166,18 +182,8 @@ def accused(result: CaseResult, fault: Fault) -> set[str]:
     return set().union(*(result.accused[step] for step in noticed(result, fault)))
 
 
-def named(result: CaseResult, fault: Fault) -> set[str]:
-    """All that it suspects, or has not heard of, at any such step."""
-    heard = [set(result.heard[step]) for step in noticed(result, fault)]
-    silent = struck(fault) - set.intersection(*heard) if heard else set()
-    return accused(result, fault) | silent
-
-
-def named_after(result: CaseResult, fault: Fault, culprits: set[str]) -> float:
-    """Time [s] from the fault's start until every culprit has been named; inf where some never is."""
-    missing = set(culprits)
-    for step in noticed(result, fault):
-        missing -= set(result.accused[step]) | (culprits - set(result.heard[step]))
-        if not missing:
-            return float(result.steps[step] - fault.start)
-    return float("inf")
+def named_at(result: CaseResult, fault: Fault, name: str) -> float:
+    """Time [s] from the fault's start until `name` is suspected or no longer heard; inf where it never is."""
+    steps = [step for step in noticed(result, fault)
+             if name in result.accused[step] or name not in result.shares[step]]
+    return float(result.steps[steps[0]] - fault.start) if steps else float("inf")
