@@ -148,7 +148,7 @@ def clean_row(result: CaseResult) -> dict[str, Any]:
     least = {kind: min(share for shares in result.shares for name, share in shares.items() if kind in name)
              for kind in ("tof", "imu")}
     return {"trajectory": result.case.trial.trajectory, "accused": len(blamed),
-            "whom": ", ".join(sorted(blamed)) or "-", **{f"least share, {kind}": share for kind, share in least.items()}}
+            "whom": ", ".join(sorted(blamed)) or "-", **{f"least share, {kind}": least[kind] for kind in least}}
 
 
 def judge(rows: Sequence[dict[str, Any]], failed: int) -> list[Claim]:
