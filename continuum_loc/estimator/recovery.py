@@ -103,26 +103,40 @@ class Recovery:
         return np.square(reach * np.repeat(self._settings.lost_sigma, 3))[:, :, None] * np.eye(6)
 
     def acquire(self) -> tuple[int, bool]:
-        """Solve the window from a guess: (iterations, whether it converged)."""
-        return self._window.acquire(self._narrow)
+        """Solve the window from a guess: (iterations, whether it converged).
+
+        The loss is tighter than when tracking: a wrong body must not pay for few far zones by many near ones.
+        """
+        if self._tof is None:
+            return self._window.acquire(lambda iteration: True)
+        self._tof.cauchy = self._tof.settings.tof.acquisition_cauchy
+        outcome = self._window.acquire(self._narrow)
+        self._tof.cauchy = self._tof.settings.tof.cauchy
+        return outcome
 
     def look_after(self, time: float, converged: bool) -> None:
         """Notice a wrong minimum by the worst ring's share of fitting zones, and look for a better body."""
-        self._find_suspects()
+        misfits = self._misfits()
         if self._tof is None or not self._settings.enabled:
             self.acquired = self.acquired or converged
+            self._suspect(misfits)
             return
+        # A ToF sensor that does not fit may be broken, or the body wrong: only a search that finds no better body
+        # tells, so that only then it is a suspect and no longer counts.
+        tof_names = {sensor.name for sensor in self._robot.tof}
+        self._suspect([name for name in misfits if name in self.suspects or name not in tof_names])
         share = self._worst_share()
         fitting = share >= self._settings.suspect_share
         self.acquired = self.acquired or (converged and fitting)
         due = self._watch.update(time, share)
         if due or (not fitting and not self.acquired and time >= self._watch.next_search):
-            self._watch.searched(time, confirmed=self._search())
+            confirmed = self._search()
+            self._watch.searched(time, confirmed)
+            if confirmed:
+                self._suspect(self._misfits())
 
     def _narrow(self, iteration: int) -> bool:
         """The gate of association: wide while the shape is a guess, then down to the tracking gate."""
-        if self._tof is None:
-            return True
         options = self._tof.settings.tof
         gate = max(options.gate, options.acquisition_gate * GATE_SHRINK**iteration)
         if gate != self._tof.gate:
@@ -140,17 +154,20 @@ class Recovery:
                 by_ring[sensor.ring] = by_ring.get(sensor.ring, 0.0) + fits[sensor.name]
         return min((fit[1] / fit[0] for fit in by_ring.values() if fit[0] > 0), default=1.0)
 
-    def _find_suspects(self) -> None:
-        """Sensors that do not fit while the others do: a wrong extrinsic, a wrong clock, a broken part."""
-        shares, suspects = self._window.fit().shares, []
+    def _misfits(self) -> list[str]:
+        """Sensors that do not fit while others of their kind do: a wrong extrinsic, a wrong clock, a broken part."""
+        shares, misfits = self._window.fit().shares, []
         for sensors in (self._robot.tof, self._robot.imu):
             names = [sensor.name for sensor in sensors if sensor.name in shares]
             healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
-            suspects += [name for name in names if healthy and shares[name] < self._settings.sensor_share]
-        self.suspects = tuple(suspects)
+            misfits += [name for name in names if healthy and shares[name] < self._settings.sensor_share]
+        return misfits
+
+    def _suspect(self, names: list[str]) -> None:
+        self.suspects = tuple(names)
         if self._tof is not None:
             for name in self._tof.weights:
-                self._tof.weights[name] = self._settings.suspect_weight if name in suspects else 1.0
+                self._tof.weights[name] = self._settings.suspect_weight if name in names else 1.0
 
     def _search(self) -> bool:
         """Try the shapes that a search finds, take one that fits better than the present body; True when the body that
@@ -227,7 +244,7 @@ class ShapeSearch:
 
     def _score(self, T: np.ndarray, snapshot: Snapshot, frames: np.ndarray) -> np.ndarray:
         return _score(T, snapshot.q[frames], snapshot.rays[frames], snapshot.variance[frames], *self._map,
-                      self.settings.score_floor**2, self.options.cauchy, self.settings.score_gate,
+                      self.settings.score_floor**2, self.options.acquisition_cauchy, self.settings.score_gate,
                       self.options.min_cosine)
 
     def _different(self, total: np.ndarray, T: np.ndarray) -> np.ndarray:

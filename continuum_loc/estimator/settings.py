@@ -37,6 +37,7 @@ class TofSettings(Settings):
     footprint: float = Field(0.0, ge=0.0, description="share of a zone's half width counted as noise on slanted "
                                                       "surfaces (1 for a sensor that integrates over its zones)")
     cauchy: float = Field(2.0, gt=0.0, description="scale of the Cauchy loss in sigmas; large switches it off")
+    acquisition_cauchy: float = Field(2.0, gt=0.0, description="the same before the first fit and when lost [sigmas]")
     gate: float = Field(0.12, gt=0.0, description="farthest map point that a zone may match [m]")
     acquisition_gate: float = Field(0.5, gt=0.0, description="the same before the first fit and when lost [m]")
     min_cosine: float = Field(0.15, ge=0.0, lt=1.0, description="least cosine of incidence for a match")

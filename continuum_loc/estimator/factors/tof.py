@@ -30,7 +30,7 @@ class TofFactor(Factor):
 
     def __init__(self, robot, grid, settings, prior_map=None, index=None):
         super().__init__(robot, grid, settings)
-        self.gate = settings.tof.gate
+        self.gate, self.cauchy = settings.tof.gate, settings.tof.cauchy
         self.weights = dict.fromkeys((sensor.name for sensor in robot.tof), 1.0)
         self._sensors = {sensor.name: (number, grid.node_at(robot.sensor_arclength(sensor.name)),
                                        sensor.mount.T_ring_sensor) for number, sensor in enumerate(robot.tof)}
@@ -82,7 +82,7 @@ class TofFactor(Factor):
         cost, squared, count = _add(
             blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, b.time - a.time, times, nodes, q, rays, variance,
             weights, *self.map_arrays, options.floor**2,
-            options.footprint * self._half_zone, options.cauchy, self.gate, options.min_cosine, fits)
+            options.footprint * self._half_zone, self.cauchy, self.gate, options.min_cosine, fits)
         by_sensor = np.zeros((len(self._names), 2))
         np.add.at(by_sensor, sensors, fits)
         heard = np.flatnonzero(np.bincount(sensors, minlength=len(self._names)))
