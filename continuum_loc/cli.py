@@ -117,7 +117,7 @@ def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db
 
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
-    from continuum_loc.estimator import load_estimator_settings
+    from continuum_loc.estimator import settings_of
     from continuum_loc.evaluation.replay import replay as run_replay
     from continuum_loc.evaluation.replay import samples_of
     from continuum_loc.evaluation.runs import new_run, save_run
@@ -129,7 +129,7 @@ def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db
     with _busy() as status:
         status.update("loading the prior map")
         map_file = map_file or scene_map_file(scene)
-        estimator = make_filter(description, load_map(map_file), load_estimator_settings(settings or description.name))
+        estimator = make_filter(description, load_map(map_file), settings_of(description.name, settings))
     result = run_replay(_progress(samples_of(bag), "replaying", _bag_duration(bag)), estimator)
     folder = new_run("replay", out)
     summary = save_run(folder, result, kind="replay", seed=seed, configuration={
@@ -179,7 +179,7 @@ def tune(out: Annotated[Path, typer.Argument(help="settings file to write (YAML)
 
     from rich.progress import Progress
 
-    from continuum_loc.estimator.settings import load_estimator_settings
+    from continuum_loc.estimator.settings import settings_of
     from continuum_loc.evaluation.split import hold_out
     from continuum_loc.evaluation.trials import scene_map_file, simulate, write_bag
     from continuum_loc.evaluation.tune import FACTORS, PARAMETERS
@@ -188,7 +188,7 @@ def tune(out: Annotated[Path, typer.Argument(help="settings file to write (YAML)
     from continuum_loc.settings import dump_settings
 
     description = load_robot(robot)
-    start = load_estimator_settings(settings or description.name)
+    start = settings_of(description.name, settings)
     with tempfile.TemporaryDirectory() as scratch, Progress(console=errors, transient=True) as progress:
         if bag is None:
             bag = Path(scratch) / "hold_out"
@@ -262,12 +262,12 @@ def evaluate(name: Annotated[str | None, typer.Argument(help="study; without one
 
 def _evaluate_bags(folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path,
                    jobs: int) -> list[Claim]:
-    from continuum_loc.estimator.settings import load_estimator_settings
+    from continuum_loc.estimator.settings import settings_of
     from continuum_loc.evaluation.bags import evaluate_bags
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
-    return evaluate_bags(folder, description, map_file, load_estimator_settings(settings or description.name), out,
+    return evaluate_bags(folder, description, map_file, settings_of(description.name, settings), out,
                          jobs)
 
 

@@ -222,7 +222,8 @@ class RobotDescription(Settings):
         if any(b - a < 1e-6 for a, b in zip(arclengths, arclengths[1:], strict=False)):
             raise ValueError(f"rings must be listed from base to tip without overlap, got s = {arclengths}")
         if arclengths[-1] > self.length + 1e-9:
-            raise ValueError(f"ring '{self.rings[-1].name}' at s = {arclengths[-1]} lies beyond the length {self.length}")
+            raise ValueError(f"ring '{self.rings[-1].name}' at s = {arclengths[-1]} lies beyond the length "
+                             f"{self.length}")
         names = [sensor.name for sensor in self.sensors] + [ring.name for ring in self.rings]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:

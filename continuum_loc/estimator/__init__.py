@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Estimate", "EstimatorSettings", "SlidingWindowFilter", "load_estimator_settings", "smooth"]
+__all__ = ["Estimate", "EstimatorSettings", "SlidingWindowFilter", "load_estimator_settings", "settings_of", "smooth"]
 
 
 def __getattr__(name: str):
@@ -18,7 +18,7 @@ def __getattr__(name: str):
         from continuum_loc.estimator.estimate import Estimate
 
         return Estimate
-    if name in ("EstimatorSettings", "load_estimator_settings"):
+    if name in ("EstimatorSettings", "load_estimator_settings", "settings_of"):
         from continuum_loc.estimator import settings
 
         return getattr(settings, name)

@@ -134,6 +134,15 @@ class EstimatorSettings(Settings):
     recovery: RecoverySettings = RecoverySettings()
 
 
+def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSettings:
+    """The settings to use for a robot: those `given` by name or file, else the preset of the robot's name, else the
+    defaults, for a robot of your own."""
+    if given:
+        return load_estimator_settings(given)
+    known = (PRESETS_FOLDER / f"{robot_name}.yaml").is_file()
+    return load_estimator_settings(robot_name) if known else EstimatorSettings()
+
+
 def load_estimator_settings(name_or_path: str | Path) -> EstimatorSettings:
     """Settings that come with the package by the robot's name (`engine`, `soft_arm`), or from a YAML file."""
     path = Path(name_or_path)

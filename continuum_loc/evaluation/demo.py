@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from continuum_loc.estimator.settings import load_estimator_settings
+from continuum_loc.estimator.settings import settings_of
 from continuum_loc.evaluation.metrics import errors, summarise
 from continuum_loc.evaluation.replay import ReplayResult, place_points, samples_of
 from continuum_loc.evaluation.replay import replay as run_replay
@@ -40,7 +40,8 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
     """Run `trial` live into a new folder under `root`, replay its bag twice, and write the report."""
     from continuum_loc.nodes.live import run_live
 
-    robot, settings = load_robot(trial.robot), load_estimator_settings(load_robot(trial.robot).name)
+    robot = load_robot(trial.robot)
+    settings = settings_of(robot.name)
     tell("building the scene and its prior map (kept for the next time)")
     map_file = scene_map_file(trial.scene)
     folder = new_run("demo", root)

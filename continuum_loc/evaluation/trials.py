@@ -97,9 +97,9 @@ def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> Replay
 def make_filter(robot: RobotDescription, prior_map: PriorMap | None,
                 settings: EstimatorSettings | None = None) -> Filter:
     """The sliding-window filter, by default with the settings that come with the robot."""
-    from continuum_loc.estimator import SlidingWindowFilter, load_estimator_settings
+    from continuum_loc.estimator import SlidingWindowFilter, settings_of
 
-    return SlidingWindowFilter(robot, prior_map, settings or load_estimator_settings(robot.name))
+    return SlidingWindowFilter(robot, prior_map, settings or settings_of(robot.name))
 
 
 def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:

@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
-from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter, load_estimator_settings
+from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter, settings_of
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.settings import PRESETS_FOLDER
 from continuum_loc.measurements import EncoderSample, Measurement, TofFrame, nanoseconds
@@ -199,8 +199,7 @@ class EstimatorNode(WorkerNode):
         if not self.settings.settings and not bundled:
             self.get_logger().warning(f"no settings are tuned for robot '{self.robot.name}': using the defaults "
                                       "(parameter `settings`; `continuum-loc tune` finds better ones)")
-            return EstimatorSettings()
-        return load_estimator_settings(self.settings.settings or self.robot.name)
+        return settings_of(self.robot.name, self.settings.settings)
 
     def _load_map(self) -> Any:
         if not self.settings.map:
