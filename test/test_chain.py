@@ -36,12 +36,13 @@ def test_solution_and_covariances_equal_dense_algebra(seed):
     chain = Chain(D, start)
     np.testing.assert_allclose(np.concatenate(chain.solve(intervals, 0)), np.linalg.solve(H, -g), atol=1e-9)
     P = np.linalg.inv(H)
-    rows = np.array([1, 4, 5])
+    A, B = np.random.default_rng(seed).normal(size=(2, 4, D))
     for k in range(K - 1):
-        chosen = np.concatenate([D * k + rows, D * (k + 1) + rows])
-        np.testing.assert_allclose(chain.joint_covariance(k, rows), P[np.ix_(chosen, chosen)], atol=1e-9)
-        alone = chain.joint_covariance(k, rows, with_next=False)
-        np.testing.assert_allclose(alone, P[np.ix_(D * k + rows, D * k + rows)], atol=1e-9)
+        pair = slice(D * k, D * (k + 2))
+        both = np.concatenate([A, B], axis=1)
+        np.testing.assert_allclose(chain.covariance(k, A, B), both @ P[pair, pair] @ both.T, atol=1e-9)
+        alone = slice(D * k, D * (k + 1))
+        np.testing.assert_allclose(chain.covariance(k, A), A @ P[alone, alone] @ A.T, atol=1e-9)
 
 
 def test_marginalising_equals_the_batch_solution():

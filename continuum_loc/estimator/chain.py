@@ -82,22 +82,19 @@ class Chain:
             offsets.append(-_solve_upper(step.L, step.y + step.Y @ offsets[-1]))
         return offsets[::-1]
 
-    def joint_covariance(self, column: int, rows: np.ndarray, with_next: bool = True) -> np.ndarray:
-        """Covariance (2 m, 2 m) of `rows` (m,) of a column and of the same rows of the next, or of the column's alone.
+    def covariance(self, column: int, A: np.ndarray, B: np.ndarray | None = None) -> np.ndarray:
+        """Covariance (m, m) of A x + B x', with A, B (m, D), of the offsets x of a column and x' of the next one.
 
-        With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 E, and X is zero above `column`: the cost
-        grows with the columns after it, not with the window.
+        With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero above `column`: the
+        cost grows with the columns after it, not with the window.
         """
-        m, D = len(rows), self.dim
-        E = np.zeros((D, 2 * m if with_next else m), order="F")
-        E[rows, np.arange(m)] = 1.0
-        X = blas.dtrsm(1.0, self._factor(column), E, lower=1)
+        X = blas.dtrsm(1.0, self._factor(column), A.T, lower=1)
         covariance = blas.dsyrk(1.0, X, trans=1, lower=1)
         for k in range(column + 1, len(self._eliminated) + 1):
             right = -(self._eliminated[k - 1].Y.T @ X)
-            if with_next and k == column + 1:
-                right[rows, m + np.arange(m)] += 1.0
-            X = blas.dtrsm(1.0, self._factor(k), np.asfortranarray(right), lower=1)
+            if B is not None and k == column + 1:
+                right += B.T
+            X = blas.dtrsm(1.0, self._factor(k), right, lower=1)
             covariance = blas.dsyrk(1.0, X, beta=1.0, c=covariance, trans=1, lower=1, overwrite_c=1)
         return _symmetrised(covariance)
 

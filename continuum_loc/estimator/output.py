@@ -9,7 +9,7 @@ from numba import njit
 
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.state import Column, Grid
+from continuum_loc.estimator.state import NODE_DIM, Column, Grid
 
 MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
@@ -48,22 +48,23 @@ def body_between(a: Column, b: Column, time: float) -> Body:
     return Body(T, (1.0 - u) * a.strain + u * b.strain, velocity)
 
 
-def motion_covariance(a: Column, b: Column, time: float, nodes: np.ndarray, P: np.ndarray,
-                      velocity_psd: np.ndarray) -> np.ndarray:
-    """Covariance (m, 12, 12) of [pose, velocity] of `nodes` (m,) at `time` between two columns.
-
-    P (24 m, 24 m) is the joint covariance of the nodes' MOTION rows in a and then in b. The bridge that the two ends
-    leave open is added.
-    """
+def motion_jacobians(a: Column, b: Column, time: float, nodes: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobians A, B (12 m, D) of [pose, velocity] of `nodes` (m,) at `time`, by the offsets of the two columns."""
     m, d, tau = len(nodes), b.time - a.time, time - a.time
     J = np.empty((m, 12, 24))
     _interpolate(a.T, a.velocity, b.T, b.velocity, d, np.full(m, tau), nodes, nodes, np.empty((m, 4, 4)),
                  np.empty((m, 6)), J[:, :6], J[:, 6:])
-    blocks = P.reshape(2, m, 12, 2, m, 12)[:, np.arange(m), :, :, np.arange(m)]  # (m, 2, 12, 2, 12)
-    out = J @ blocks.reshape(m, 24, 24) @ np.swapaxes(J, 1, 2)
+    out = np.zeros((2, m, 12, dim))
+    for i, node in enumerate(nodes):
+        out[:, i, :, NODE_DIM * node + MOTION] = J[i].reshape(12, 2, 12).transpose(2, 1, 0)
+    return out[0].reshape(12 * m, dim), out[1].reshape(12 * m, dim)
+
+
+def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -> np.ndarray:
+    """(12, 12) covariance of [pose, velocity] at `time` that the two columns' ends leave open."""
     open_bridge = np.empty((2, 2))
-    gp.bridge(tau, d, open_bridge)
-    return out + np.kron(open_bridge, np.diag(velocity_psd))
+    gp.bridge(time - a.time, b.time - a.time, open_bridge)
+    return np.kron(open_bridge, np.diag(velocity_psd))
 
 
 @njit(cache=True)

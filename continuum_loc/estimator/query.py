@@ -40,8 +40,7 @@ class History:
         column = window.column(k)
         if self._columns and column.time < self._columns[-1].column.time + TIME_EPSILON:
             return
-        rows = np.arange(NODE_DIM * window.grid.nodes)
-        P = window.chain.joint_covariance(k, rows, with_next=False)
+        P = window.chain.covariance(k, np.eye(NODE_DIM * window.grid.nodes, window.grid.dim))
         pairs = [slice(NODE_DIM * n, NODE_DIM * (n + 2)) for n in range(window.grid.nodes - 1)]
         self._columns.append(PastColumn(column, np.array([P[pair, pair] for pair in pairs])))
         while self._columns[0].column.time < column.time - self._duration:
@@ -70,9 +69,14 @@ def state_at(window: Window, history: History, time: float, s: float) -> BodySta
 
 def _inside(window: Window, time: float, n: int):
     k = window.knot_before(time)
-    rows = np.arange(NODE_DIM * n, NODE_DIM * (n + 2))
-    P = window.chain.joint_covariance(k, rows)
+    A = _rows_of(window, n)
+    P = window.chain.covariance(k, np.concatenate([A, 0.0 * A]), np.concatenate([0.0 * A, A]))
     return _between(window, window.column(k), window.column(k + 1), P, time, n)
+
+
+def _rows_of(window: Window, n: int) -> np.ndarray:
+    """(36, D) selection of two neighbouring nodes' rows."""
+    return np.eye(2 * NODE_DIM, window.grid.dim, NODE_DIM * n)
 
 
 def _behind(window: Window, history: History, time: float, n: int):
@@ -122,7 +126,7 @@ def _ahead(window: Window, time: float, n: int):
     """Two nodes predicted from the newest column at constant body-frame velocity."""
     newest, dt = window.column(-1), time - window.columns[-1].time
     k, m = len(window.intervals) - 1, NODE_DIM
-    P = window.chain.joint_covariance(k, np.arange(m * n, m * (n + 2)))[2 * m:, 2 * m:]
+    P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
     later = newest.predict(dt)
     J, Q = np.zeros((2 * m, 2 * m)), np.zeros((2 * m, 2 * m))
     growth = np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.diag(window.priors.velocity_psd))

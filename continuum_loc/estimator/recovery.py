@@ -17,7 +17,7 @@ from numba import njit
 
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Status
-from continuum_loc.estimator.factors.tof import TofFactor, frame_information
+from continuum_loc.estimator.factors.tof import TofFactor, associate, frame_information
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Column, Grid, shape_from_strain
@@ -73,7 +73,7 @@ class Snapshot:
     def of(cls, rows: list[tuple]) -> Snapshot:
         """From a ToF factor's rows, in order of arrival."""
         newest = {row[0]: row for row in rows}
-        _, nodes, q, rays, variance = zip(*(newest[sensor] for sensor in sorted(newest)), strict=True)
+        _, nodes, q, rays, variance, _ = zip(*(newest[sensor] for sensor in sorted(newest)), strict=True)
         return cls(np.array(nodes), *(np.ascontiguousarray(np.array(x)[:, ::ZONE_STRIDE]) for x in (q, rays, variance)))
 
 
@@ -290,11 +290,13 @@ def place(grid: Grid, column: Column, T_map_base: np.ndarray, strain: np.ndarray
 
 @njit(cache=True)
 def _score(T, q, rays, variance, arrays, cloud, normals, planarity, map_variance, floor2, cauchy, gate, min_cosine):
-    H, g, fit = np.empty((6, 6)), np.empty(6), np.zeros(2)
+    """Robust cost (M,) of the frames at each pose T (M, 4, 4)."""
+    H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.empty(q.shape[1], np.int64)
     out = np.zeros(T.shape[0])
     for m in range(T.shape[0]):
         for f in range(q.shape[0]):
-            cost, _, _ = frame_information(T[m], q[f], rays[f], variance[f], 1.0, arrays, cloud, normals, planarity,
-                                           map_variance, floor2, 0.0, cauchy, gate, min_cosine, H, g, fit)
+            associate(T[m], q[f], rays[f], variance[f], arrays, normals, gate, min_cosine, hits)
+            cost, _, _ = frame_information(T[m], q[f], rays[f], variance[f], hits, 1.0, cloud, normals, planarity,
+                                           map_variance, floor2, 0.0, cauchy, gate, H, g, fit)
             out[m] += cost
     return out

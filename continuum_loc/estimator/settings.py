@@ -40,6 +40,7 @@ class TofSettings(Settings):
     acquisition_cauchy: float = Field(2.0, gt=0.0, description="the same before the first fit and when lost [sigmas]")
     gate: float = Field(0.12, gt=0.0, description="farthest map point that a zone may match [m]")
     acquisition_gate: float = Field(0.5, gt=0.0, description="the same before the first fit and when lost [m]")
+    reassociate: float = Field(0.002, ge=0.0, description="a frame that moved farther is matched to the map anew [m]")
     min_cosine: float = Field(0.15, ge=0.0, lt=1.0, description="least cosine of incidence for a match")
     planarity_power: float = Field(1.0, ge=0.0, description="weight = planarity ** power; 0 switches it off")
 

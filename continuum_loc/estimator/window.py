@@ -16,7 +16,7 @@ import numpy as np
 from continuum_loc.estimator.chain import Chain, Message, SingularError
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.output import MOTION, Body, body_between, motion_covariance
+from continuum_loc.estimator.output import Body, body_between, motion_bridge, motion_jacobians
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import NODE_DIM, Column, Grid
@@ -264,6 +264,8 @@ class Window:
 
     def motion_covariance(self, time: float, nodes: np.ndarray) -> np.ndarray:
         """Covariance (m, 12, 12) of [pose, velocity] of `nodes` (m,) at `time` in the window."""
-        k = self.knot_before(time)
-        P = self.chain.joint_covariance(k, (NODE_DIM * nodes[:, None] + MOTION).ravel())
-        return motion_covariance(self.column(k), self.column(k + 1), time, nodes, P, self.priors.velocity_psd)
+        k, m = self.knot_before(time), len(nodes)
+        a, b = self.column(k), self.column(k + 1)
+        P = self.chain.covariance(k, *motion_jacobians(a, b, time, nodes, self.grid.dim))
+        own = P.reshape(m, 12, m, 12)[np.arange(m), :, np.arange(m)]
+        return own + motion_bridge(a, b, time, self.priors.velocity_psd)

@@ -18,6 +18,7 @@ from continuum_loc.mapping.voxel_index import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 
 MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
+REACH = 1.0  # [m] range at which a turn of the body moves a zone, to decide when to associate anew
 FIT_SIGMAS = 3.0  # a zone within so many sigmas of its surface counts as fitting
 HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
 
@@ -42,6 +43,8 @@ class TofFactor(Factor):
             self._planarity = prior_map.planarity**settings.tof.planarity_power
             self._map_variance = prior_map.sigma**2
         model = robot.tof_model
+        self._noise_distance = np.array(model.noise_distance)
+        self._noise_coefficient = np.array(model.noise_coefficient)
         self._half_zone = np.tan(np.radians(model.fov_deg) / 2.0) / max(model.rows, model.columns)
 
     @property
@@ -58,40 +61,85 @@ class TofFactor(Factor):
         if points.shape != (model.rows * model.columns, 3):
             raise MeasurementError("wrong size", f"ToF frame of '{measurement.sensor}' has points {points.shape}; "
                                                  f"the robot description says {model.rows} x {model.columns} zones")
-        with np.errstate(invalid="ignore"):
-            ranges = np.linalg.norm(points, axis=1)
-            usable = np.isfinite(ranges) & (ranges >= model.min_range) & (ranges <= model.max_range)
-        if np.any(usable) and self._repeats.frozen(measurement.sensor, points):
+        q, rays = np.empty(points.shape), np.empty(points.shape)
+        variance = np.empty(len(points))
+        if _beams(points, np.asarray(measurement.status), T_ring_sensor, model.min_range, model.max_range,
+                  self._noise_distance, self._noise_coefficient, q, rays, variance) == 0:
+            return number, node, q, rays, variance, Association(len(points))
+        if self._repeats.frozen(measurement.sensor, points):
             raise MeasurementError("frozen", f"ToF sensor '{measurement.sensor}' repeats itself to the last bit")
-        half = np.isin(measurement.status, TOF_HALF_CONFIDENT)
-        usable &= (measurement.status == TOF_VALID) | half
-        distance = np.where(usable, ranges, 1.0)
-        variance = np.square(model.sigma(distance)) * np.where(half, HALF_CONFIDENCE_VARIANCE, 1.0)
-        q = np.where(usable[:, None], points, 0.0) @ T_ring_sensor[:3, :3].T
-        rays = q / distance[:, None]
-        return number, node, q + T_ring_sensor[:3, 3], rays, np.where(usable, variance, np.inf)
+        return number, node, q, rays, variance, Association(len(points))
 
     def stack(self, times, rows):
-        return (times, *(np.array([row[i] for row in rows]) for i in range(5)))
+        """The association of each row becomes a view into the stacked arrays, so that it outlives the next stacking."""
+        kept = [row[5] for row in rows]
+        hits, poses = np.array([one.hits for one in kept]), np.array([one.T_map_body for one in kept])
+        for one, hit, T in zip(kept, hits, poses, strict=True):
+            one.hits, one.T_map_body = hit, T
+        return (times, *(np.array([row[i] for row in rows]) for i in range(5)), hits, poses)
 
     def linearise(self, batch, a, b, blocks):
-        times, sensors, nodes, q, rays, variance = batch
+        times, sensors, nodes, q, rays, variance, hits, poses = batch
         options = self.settings.tof
         weights = np.array([self.weights[self._names[s]] for s in sensors])
         fits = np.zeros((len(times), 2))
         cost, squared, count = _add(
             blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, b.time - a.time, times, nodes, q, rays, variance,
-            weights, *self.map_arrays, options.floor**2,
-            options.footprint * self._half_zone, self.cauchy, self.gate, options.min_cosine, fits)
+            weights, *self.map_arrays, options.floor**2, options.footprint * self._half_zone, self.cauchy, self.gate,
+            options.min_cosine, options.reassociate, hits, poses, fits)
         by_sensor = np.zeros((len(self._names), 2))
         np.add.at(by_sensor, sensors, fits)
         heard = np.flatnonzero(np.bincount(sensors, minlength=len(self._names)))
         return FactorReport(cost, squared, count, {self._names[s]: by_sensor[s] for s in heard})
 
 
+class Association:
+    """Map points that a frame's zones were matched to, and the pose at which; its last element holds the gate, so that
+    another gate associates anew."""
+
+    __slots__ = ("T_map_body", "hits")
+
+    def __init__(self, zones: int):
+        self.hits = np.full(zones, -1, np.int64)
+        self.T_map_body = np.zeros((4, 4))
+
+
+@njit(cache=True)
+def _beams(points, status, T_ring_sensor, min_range, max_range, noise_distance, noise_coefficient, q, rays, variance):
+    """Zones in the ring's frame: q, rays (Z, 3), variance (Z,) infinite where unusable; the number of usable ones."""
+    usable = 0
+    for z in range(points.shape[0]):
+        x, y, w = points[z, 0], points[z, 1], points[z, 2]
+        distance = np.sqrt(x * x + y * y + w * w)
+        half = status[z] == TOF_HALF_CONFIDENT[0] or status[z] == TOF_HALF_CONFIDENT[1]
+        valid = (status[z] == TOF_VALID or half) and min_range <= distance <= max_range
+        for i in range(3):
+            turned = T_ring_sensor[i, 0] * x + T_ring_sensor[i, 1] * y + T_ring_sensor[i, 2] * w
+            q[z, i] = (turned if valid else 0.0) + T_ring_sensor[i, 3]
+            rays[z, i] = turned / distance if valid else 0.0
+        if not valid:
+            variance[z] = np.inf
+            continue
+        usable += 1
+        sigma = np.interp(distance, noise_distance, noise_coefficient) * distance
+        variance[z] = sigma * sigma * (HALF_CONFIDENCE_VARIANCE if half else 1.0)
+    return usable
+
+
+@njit(cache=True)
+def _moved(T, before, reach):
+    """The farthest that a point within `reach` of the body moved between two poses, at most [m]."""
+    shift, turn = 0.0, 0.0
+    for i in range(3):
+        shift += (T[i, 3] - before[i, 3]) ** 2
+        for j in range(3):
+            turn += (T[i, j] - before[i, j]) ** 2
+    return np.sqrt(shift) + reach * np.sqrt(0.5 * turn)
+
+
 @njit(cache=True)
 def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights, arrays, cloud, normals, planarity,
-         map_variance, floor2, footprint, cauchy, gate, min_cosine, fits):
+         map_variance, floor2, footprint, cauchy, gate, min_cosine, reassociate, hits, poses, fits):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
@@ -102,9 +150,13 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights,
     for f in range(times.shape[0]):
         n = nodes[f]
         gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
+        if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
+            associate(T, q[f], rays[f], variance[f], arrays, normals, gate, min_cosine, hits[f])
+            poses[f] = T
+            poses[f, 3, 3] = gate
         frame_cost, frame_squared, frame_count = frame_information(
-            T, q[f], rays[f], variance[f], weights[f], arrays, cloud, normals, planarity, map_variance, floor2,
-            footprint, cauchy, gate, min_cosine, H_body, g_body, fits[f])
+            T, q[f], rays[f], variance[f], hits[f], weights[f], cloud, normals, planarity, map_variance, floor2,
+            footprint, cauchy, gate, H_body, g_body, fits[f])
         gp.time_index(n, VELOCITY, size, index)
         gp.add_local(H, g, index, H_body, g_body, J_pose, work)
         cost += frame_cost
@@ -114,8 +166,21 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights,
 
 
 @njit(cache=True)
-def frame_information(T, q, rays, variance, weight, arrays, cloud, normals, planarity, map_variance, floor2,
-                      footprint, cauchy, gate, min_cosine, H, g, fit):
+def associate(T, q, rays, variance, arrays, normals, gate, min_cosine, hits):
+    """hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body; -1 where there is none."""
+    zones = q.shape[0]
+    points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
+    for z in range(zones):
+        nowhere = not np.isfinite(variance[z])  # a query of nan matches nothing
+        for i in range(3):
+            points[z, i] = np.nan if nowhere else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
+            directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
+    nearest_facing_batch(arrays, normals, points, directions, gate, min_cosine, hits, distance2)
+
+
+@njit(cache=True)
+def frame_information(T, q, rays, variance, hits, weight, cloud, normals, planarity, map_variance, floor2, footprint,
+                      cauchy, gate, H, g, fit):
     """Normal equations H (6, 6), g (6,) of one frame at T_map_body, and [usable, fitting] zones in `fit`.
 
     Returns the robust cost, the sum of weighted squared residuals and the number of matched zones. An unmatched
@@ -124,19 +189,11 @@ def frame_information(T, q, rays, variance, weight, arrays, cloud, normals, plan
     H[:, :] = 0.0
     g[:] = 0.0
     cost, squared, count = 0.0, 0.0, 0
-    zones, row = q.shape[0], np.empty(6)
+    row = np.empty(6)
     c2 = cauchy * cauchy
-    points, directions = np.empty((zones, 3)), np.empty((zones, 3))
-    hits, distance2 = np.empty(zones, np.int64), np.empty(zones)
-    for z in range(zones):
-        for i in range(3):
-            nowhere = not np.isfinite(variance[z])  # a query of nan matches nothing
-            points[z, i] = np.nan if nowhere else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
-            directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
-    nearest_facing_batch(arrays, normals, points, directions, gate, min_cosine, hits, distance2)
     fit[0] = 0.0
     fit[1] = 0.0
-    for z in range(zones):
+    for z in range(q.shape[0]):
         if not np.isfinite(variance[z]):
             continue
         fit[0] += 1.0
@@ -145,11 +202,15 @@ def frame_information(T, q, rays, variance, weight, arrays, cloud, normals, plan
             cost += 0.5 * weight * c2 * np.log1p(gate * gate / (c2 * (variance[z] + floor2)))
             continue
         a, b, c = q[z, 0], q[z, 1], q[z, 2]
-        x, y, w = points[z, 0], points[z, 1], points[z, 2]
-        dx, dy, dz = directions[z, 0], directions[z, 1], directions[z, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        w = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
         nx, ny, nz = normals[hit, 0], normals[hit, 1], normals[hit, 2]
         r = nx * (x - cloud[hit, 0]) + ny * (y - cloud[hit, 1]) + nz * (w - cloud[hit, 2])
-        cosine = nx * dx + ny * dy + nz * dz
+        row[0] = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
+        row[1] = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
+        row[2] = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
+        cosine = row[0] * rays[z, 0] + row[1] * rays[z, 1] + row[2] * rays[z, 2]
         cosine2 = cosine * cosine
         spread = footprint * np.sqrt(a * a + b * b + c * c)
         total = variance[z] * cosine2 + spread * spread * (1.0 - cosine2) + floor2 + map_variance
@@ -157,9 +218,6 @@ def frame_information(T, q, rays, variance, weight, arrays, cloud, normals, plan
         robust = 1.0 / (1.0 + u2 / c2)
         alpha = weight * planarity[hit]
         information = alpha * robust / total
-        row[0] = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
-        row[1] = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
-        row[2] = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
         row[3] = b * row[2] - c * row[1]
         row[4] = c * row[0] - a * row[2]
         row[5] = a * row[1] - b * row[0]
