@@ -226,6 +226,8 @@ def write_page(out: Path, title: str, text: str, claims: Sequence[Claim],
              "holds": claim.holds} for claim in sorted(claims, key=lambda claim: claim.holds)]
     parts = [f"# {title}", text, "## Claims", markdown(pd.DataFrame(rows))]
     for name, table in tables.items():
+        if not table:
+            continue
         parts += [f"## {name}", markdown(pd.DataFrame(list(table)))]
     path = out / "study.md"
     path.write_text("\n\n".join(part.rstrip() for part in parts) + "\n")

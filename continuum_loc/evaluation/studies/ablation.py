@@ -74,13 +74,15 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     warm = [result for result in results if result.case.name in VARIANTS]
     cold = [result for result in results if result.case.name in COLD]
     claims = judge(warm, cold)
-    tables = {"ablation": [variant_row(name, members) for name, members in by_name(warm).items()],
+    tables = {"ablation": variant_rows([result for result in warm if as_mapped(result)]),
+              "ablation_changed_scene": variant_rows([result for result in warm if not as_mapped(result)]),
               "ablation_trials": [trial_row(result) for result in warm if result.run],
               "cold_starts": [cold_row(result) for result in cold if result.run]}
     write_study(out, claims, seed=seed, settings={"cases": cases}, tables=tables,
                 extra={"quick": quick, "hold_out": HOLD_OUT["engine"], "failed": failures(results)})
     write_page(out, "Ablation: the engine robot", TEXT.format(drift=drift(warm), minima=minima(cold)), claims,
-               {"By variant": tables["ablation"], "Cold starts": tables["cold_starts"]})
+               {"By variant": tables["ablation"], "By variant, in a scene that differs from its map":
+                tables["ablation_changed_scene"], "Cold starts": tables["cold_starts"]})
     return claims
 
 
@@ -112,6 +114,11 @@ def by_name(results: Sequence[CaseResult]) -> dict[str, list[CaseResult]]:
     return found
 
 
+def as_mapped(result: CaseResult) -> bool:
+    """Whether the map is that of the scene."""
+    return result.case.trial.map_scene in (None, result.case.trial.scene)
+
+
 def judge(warm: Sequence[CaseResult], cold: Sequence[CaseResult]) -> list[Claim]:
     """The issue's bound for trials without strain, and the paper's two claims as figures."""
     groups = by_name(warm) | by_name(cold)
@@ -130,7 +137,8 @@ def judge(warm: Sequence[CaseResult], cold: Sequence[CaseResult]) -> list[Claim]
 
 def drift_claims(groups: dict[str, list[CaseResult]]) -> list[Claim]:
     """Without ToF the error grows along the body; with it the tip is several times better."""
-    without, everything = ring_errors(groups["without ToF"]), ring_errors(groups["all sensors"])
+    without, everything = (ring_errors([result for result in groups[name] if as_mapped(result)])
+                           for name in ("without ToF", "all sensors"))
     return [at_least("without ToF: tip MAE over the first ring's (drift along the body)", without[-1] / without[0],
                      "ratio", 2.0),
             at_least("without ToF: tip MAE over that with all sensors", without[-1] / everything[-1], "ratio", 1.5)]
@@ -144,6 +152,11 @@ def ring_errors(results: Sequence[CaseResult]) -> np.ndarray:
 def found_after(result: CaseResult) -> float:
     """Time [s] after which every ring stays nearer than FOUND; inf where that never happens."""
     return settled_since(result.times, result.worst_ring < FOUND)
+
+
+def variant_rows(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
+    """One row per variant, all over the same trials."""
+    return [variant_row(name, members) for name, members in by_name(results).items()]
 
 
 def variant_row(name: str, results: Sequence[CaseResult]) -> dict[str, Any]:
@@ -187,7 +200,8 @@ def drift(warm: Sequence[CaseResult]) -> str:
     groups = by_name(warm)
     if "without ToF" not in groups or "all sensors" not in groups:
         return "no figures, as the trials failed"
-    without, everything = 100.0 * ring_errors(groups["without ToF"]), 100.0 * ring_errors(groups["all sensors"])
+    without, everything = (100.0 * ring_errors([result for result in groups[name] if as_mapped(result)])
+                           for name in ("without ToF", "all sensors"))
     return (f"without ToF it goes from {without[0]:.2f} cm at the first ring to {without[-1]:.2f} cm at the tip, with "
             f"all sensors from {everything[0]:.2f} cm to {everything[-1]:.2f} cm")
 
