@@ -64,6 +64,8 @@ class SlidingWindowFilter:
         self._cycle: set[str] = set()
         self._last_cycle: set[str] = set()
         self._cycle_start: int | None = None
+        self._cycle_stamp: int = 0
+        self._output: int = 0
 
     def _make_tof(self, prior_map) -> TofFactor | None:
         if prior_map is None or not self.settings.tof.enabled or not self.robot.tof:
@@ -132,6 +134,7 @@ class SlidingWindowFilter:
             self.counts["used"][type(measurement).__name__] += 1
             self.newest = max(self.newest, measurement.stamp)
             self._rest.note(measurement)
+            self.recovery.hear(getattr(measurement, "sensor", ""), time)
         return any(used)
 
     def _add(self, factor: Factor, time: float, measurement: Measurement) -> bool:
@@ -162,11 +165,14 @@ class SlidingWindowFilter:
         if self.tof is None or not isinstance(measurement, TofFrame):
             return False
         self._cycle.add(measurement.sensor)
+        self._cycle_stamp = max(self._cycle_stamp, measurement.stamp)
         return bool(self._last_cycle) and self._cycle >= self._last_cycle or len(self._cycle) == len(self.robot.tof)
 
     # ------------------------------------------------------------------ one step
 
     def _step(self) -> Estimate | None:
+        # The ToF frames set the time: a clock that runs ahead of theirs must not.
+        self._output = max(self._cycle_stamp if self._cycle else self.newest, self._output)
         self._last_cycle, self._cycle, self._cycle_start = self._cycle, set(), None
         if not self.window.intervals:
             return None
@@ -176,7 +182,7 @@ class SlidingWindowFilter:
             return self._estimate(iterations, converged, started)
 
     def _solve(self) -> tuple[int, bool]:
-        time = seconds(self.newest, self.epoch)
+        time = seconds(self._output, self.epoch)
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
             self._guess_shape()
         try:
@@ -208,7 +214,7 @@ class SlidingWindowFilter:
     # ------------------------------------------------------------------ the output
 
     def _estimate(self, iterations: int, converged: bool, started: float) -> Estimate:
-        now = seconds(self.newest, self.epoch)
+        now = seconds(self._output, self.epoch)
         before = now - self.settings.lag
         lagged = None
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
@@ -220,6 +226,7 @@ class SlidingWindowFilter:
         rings, body, fit = self.grid.ring_nodes, self.window.body(time), self.window.fit()
         covariance = self.window.motion_covariance(time, rings)
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
+        covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
         return Estimate(
             stamp=self.epoch + nanoseconds(time), T_map_ring=body.T[rings], covariance=covariance[:, :6, :6],
             strain=body.strain[rings], velocity=body.velocity[rings], velocity_covariance=covariance[:, 6:, 6:],

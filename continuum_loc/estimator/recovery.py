@@ -88,6 +88,8 @@ class Recovery:
         self.suspects: tuple[str, ...] = ()
         self._robot, self._window, self._tof, self._settings = robot, window, tof, settings
         self._watch = Watch(settings)
+        self._heard: dict[str, float] = {}
+        self._doubt = 0.0
         self._shapes = None if tof is None else ShapeSearch(window.grid, tof, settings, window.priors)
 
     @property
@@ -97,9 +99,13 @@ class Recovery:
             return "lost"
         return "tracking" if self.acquired else "initialising"
 
+    def hear(self, sensor: str, time: float) -> None:
+        """Note that a sensor gave a usable sample at `time` [s]."""
+        self._heard[sensor] = max(time, self._heard.get(sensor, time))
+
     def doubt(self, s: np.ndarray) -> np.ndarray:
-        """(m, 6, 6) covariance to add at arclengths s (m,) while lost: it grows from the base to the tip."""
-        reach = (s / self._window.grid.s[-1])[:, None] if self._watch.lost else np.zeros((len(s), 1))
+        """(m, 6, 6) covariance to add at arclengths s (m,) while in doubt or lost; it grows from base to tip."""
+        reach = self._doubt * (s / self._window.grid.s[-1])[:, None]
         return np.square(reach * np.repeat(self._settings.lost_sigma, 3))[:, :, None] * np.eye(6)
 
     def acquire(self) -> tuple[int, bool]:
@@ -116,7 +122,7 @@ class Recovery:
 
     def look_after(self, time: float, converged: bool) -> None:
         """Notice a wrong minimum by the worst ring's share of fitting zones, and look for a better body."""
-        misfits = self._misfits()
+        misfits = self._misfits() + self._silent(time)
         if self._tof is None or not self._settings.enabled:
             self.acquired = self.acquired or converged
             self._suspect(misfits)
@@ -124,7 +130,8 @@ class Recovery:
         # A ToF sensor that does not fit may be broken, or the body wrong: only a search that finds no better body
         # tells, so that only then it is a suspect and no longer counts.
         tof_names = {sensor.name for sensor in self._robot.tof}
-        self._suspect([name for name in misfits if name in self.suspects or name not in tof_names])
+        silent = self._silent(time)
+        self._suspect([name for name in misfits if name in self.suspects or name not in tof_names or name in silent])
         share = self._worst_share()
         fitting = share >= self._settings.suspect_share
         self.acquired = self.acquired or (converged and fitting)
@@ -133,7 +140,8 @@ class Recovery:
             confirmed = self._search()
             self._watch.searched(time, confirmed)
             if confirmed:
-                self._suspect(self._misfits())
+                self._suspect(self._misfits() + silent)
+        self._doubt = self._how_doubtful(self._worst_share())
 
     def _narrow(self, iteration: int) -> bool:
         """The gate of association: wide while the shape is a guess, then down to the tracking gate."""
@@ -162,6 +170,23 @@ class Recovery:
             healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
             misfits += [name for name in names if healthy and shares[name] < self._settings.sensor_share]
         return misfits
+
+    def _silent(self, time: float) -> list[str]:
+        """Sensors without a usable sample for long (silent, frozen or refused) while others of their kind speak."""
+        silent = []
+        for sensors in (self._robot.tof if self._tof is not None else (), self._robot.imu):
+            ages = {sensor.name: time - self._heard.get(sensor.name, 0.0) for sensor in sensors}
+            if ages and min(ages.values()) < self._settings.silence:
+                silent += [name for name, age in ages.items() if age >= self._settings.silence]
+        return silent
+
+    def _how_doubtful(self, share: float) -> float:
+        """1 while lost; while suspect and not yet searched, as far as the worst ring's share has sunk; else 0."""
+        if self._watch.lost:
+            return 1.0
+        if self._watch.since is None or self._watch.backoff > 1.0:
+            return 0.0
+        return max(1.0 - share / self._settings.suspect_share, 0.0)
 
     def _suspect(self, names: list[str]) -> None:
         self.suspects = tuple(names)

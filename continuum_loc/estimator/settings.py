@@ -50,7 +50,8 @@ class GyroSettings(Settings):
 
     enabled: bool = True
     scale: float = Field(1.5, gt=0.0, description="factor on the datasheet's noise")
-    cauchy: float = Field(4.0, gt=0.0, description="scale of the Cauchy loss in sigmas")
+    cauchy: float = Field(100.0, gt=0.0, description="scale of the Cauchy loss in sigmas: wide, as a body that rattles "
+                                                     "faster than the knots must keep its mean rate")
     bias_sigma: float = Field(0.02, gt=0.0, description="spread of the bias at start [rad/s]")
     bias_walk: float = Field(1e-4, gt=0.0, description="random walk of the bias [rad/s/sqrt(s)]")
     rest_time: float = Field(0.5, ge=0.0, description="initial time at rest whose average gives the bias; 0 to "
@@ -108,11 +109,12 @@ class RecoverySettings(Settings):
     score_gate: float = Field(0.3, gt=0.0, description="farthest map point that a zone may match in the search [m]")
     score_floor: float = Field(0.03, gt=0.0, description="noise that stands for the search's coarseness [m]")
     margin: float = Field(0.1, ge=0.0, description="share by which another body's cost must be lower to be taken")
-    sensor_share: float = Field(0.6, ge=0.0, le=1.0, description="share of fitting samples below which one sensor "
+    sensor_share: float = Field(0.7, ge=0.0, le=1.0, description="share of fitting samples below which one sensor "
                                                                  "among healthy ones is suspect")
+    silence: float = Field(0.5, gt=0.0, description="time without a usable sample that makes a sensor suspect [s]")
     suspect_weight: float = Field(0.05, gt=0.0, le=1.0, description="weight of a suspect ToF sensor")
     lost_sigma: tuple[float, float] = Field((0.1, 0.3), description="spread added to the tip's pose while lost, less "
-                                                                    "towards the base [m, rad]")
+                                                                    "towards the base and while in doubt [m, rad]")
 
 
 class EstimatorSettings(Settings):
@@ -124,6 +126,9 @@ class EstimatorSettings(Settings):
     output_rate: float = Field(15.0, gt=0.0, description="steps per second of data without ToF sensors to set the pace")
     node_spacing: float = Field(0.16, gt=0.0, description="greatest distance between nodes on the backbone [m]")
     history: float = Field(60.0, ge=0.0, description="time behind the window that queries reach [s]")
+    calibration_sigma: tuple[float, float] = Field(
+        (0.0, 0.0), description="spread that mounting errors leave on each ring's pose, which no averaging removes; "
+                                "added to the published covariance [m, rad]")
     backbone_points: int = Field(61, ge=2, description="poses of the published backbone")
     prior: PriorSettings = PriorSettings()
     tof: TofSettings = TofSettings()

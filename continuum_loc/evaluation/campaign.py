@@ -145,10 +145,11 @@ def _estimate(out: Path, trial: Trial, settings: EstimatorSettings | None) -> Ou
 def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | None) -> Outcome:
     from continuum_loc.evaluation.replay import replay
     from continuum_loc.evaluation.runs import save_run
-    from continuum_loc.evaluation.trials import configuration, make_filter, scene_map
+    from continuum_loc.evaluation.trials import configuration, make_filter, scene_map, trial_settings
     from continuum_loc.robot import load_robot
 
-    estimator = make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene), settings)
+    estimator = make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene),
+                            settings or trial_settings(trial))
     resolved = configuration(trial, estimator=estimator.settings)
     key = hashlib.sha256(json.dumps([plain(resolved), asdict(trial)], sort_keys=True).encode()).hexdigest()
     summary_file = folder / "summary.json"

@@ -91,7 +91,17 @@ def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSa
 def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
     """Simulate and estimate, both in this thread; only the estimator is timed."""
     robot = load_robot(trial.robot)
-    return replay(simulate(trial), make_filter(robot, scene_map(trial.map_scene or trial.scene), settings))
+    return replay(simulate(trial), make_filter(robot, scene_map(trial.map_scene or trial.scene),
+                                               settings or trial_settings(trial)))
+
+
+def trial_settings(trial: Trial) -> EstimatorSettings:
+    """The settings for the robot with sensors of the trial's fidelity, where there are any, else the robot's."""
+    from continuum_loc.estimator.settings import PRESETS_FOLDER, settings_of
+
+    robot = load_robot(trial.robot).name
+    special = f"{robot}_{trial.fidelity}"
+    return settings_of(special if (PRESETS_FOLDER / f"{special}.yaml").is_file() else robot)
 
 
 def make_filter(robot: RobotDescription, prior_map: PriorMap | None,

@@ -18,7 +18,7 @@ from continuum_loc.estimator.factors.base import (
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.measurements import ImuSample
 
-FIT_SQUARED = 16.3  # 99.9 % of a chi-square of three dimensions
+FIT_SQUARED = 16.0  # an IMU fits while its mean residual is below four sigmas of one sample; rattling averages out
 MOST_REPEATS = 20  # a real gyro at rest repeats a sample now and then, through its quantisation
 
 
@@ -65,6 +65,7 @@ def _add(H, g, T_a, v_a, T_b, v_b, bias, dt, times, nodes, imus, omega, weight, 
     J, index, e, weights = np.zeros((3, 27)), np.empty(27, np.int64), np.empty(3), np.empty(3)
     size = H.shape[0] // 2
     cost, squared = 0.0, 0.0
+    means = np.zeros((fits.shape[0], 3))
     for m in range(times.shape[0]):
         n = nodes[m]
         gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
@@ -82,7 +83,11 @@ def _add(H, g, T_a, v_a, T_b, v_b, bias, dt, times, nodes, imus, omega, weight, 
             weights[i] = weight * robust
         gp.add_rows(H, g, index, e, J, weights)
         fits[imus[m], 0] += 1.0
-        fits[imus[m], 1] += 1.0 if u2 < FIT_SQUARED else 0.0
+        for i in range(3):
+            means[imus[m], i] += e[i]
         cost += 0.5 * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
         squared += u2 * robust
+    for imu in range(fits.shape[0]):
+        mean2 = np.sum(means[imu] ** 2) / max(fits[imu, 0], 1.0) ** 2
+        fits[imu, 1] = fits[imu, 0] if mean2 * weight < FIT_SQUARED else 0.0
     return cost, squared
