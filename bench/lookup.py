@@ -15,13 +15,12 @@ each pair. Its voxel map looks no further than the 27 voxels around, so that it 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import numpy as np
 
+from continuum_loc.evaluation.bench import one_core
 from continuum_loc.mapping.build import sample_mesh
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import PATIENCE
@@ -39,7 +38,7 @@ def run(quick: bool = False) -> list[dict]:
     workloads = {"filter": _filter_frames(prior, 5 if quick else 20), "scattered": [_scattered(prior)]}
     peers = dict(_peers(prior))
     rows = []
-    with _one_core():
+    with one_core():
         for name, batches in workloads.items():
             for _ in range(PATIENCE):
                 _ask(lambda q: index.nearest(q, MAX_DISTANCE), batches)
@@ -61,7 +60,7 @@ def scaling(quick: bool = False) -> list[dict]:
         started = time.perf_counter()
         index = prior.index(reach=MAX_DISTANCE)
         built = time.perf_counter() - started
-        with _one_core():
+        with one_core():
             first = _ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames)
             for _ in range(PATIENCE):
                 _ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames)
@@ -168,17 +167,6 @@ def _kiss_icp_peer(prior: PriorMap, voxel: float = 0.03) -> Iterator[tuple[str, 
         return registration._align_points_to_map(points, voxel_map, np.eye(4), MAX_DISTANCE, 0.01)
 
     yield "KISS-ICP registration step", query
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    """Confine the process to one of its cores: libraries that would use threads share it."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(cores)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
 
 
 def _ask(query: Query, batches: list[np.ndarray]) -> float:

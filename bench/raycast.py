@@ -10,13 +10,12 @@ Ours also looks up normals and faces; MuJoCo's casters are asked for distances a
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 
+from continuum_loc.evaluation.bench import one_core
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.raycast import RayCaster, cast_capsules
 from continuum_loc.simulator.scenes import Scene, load_scene, scene_of_solid
@@ -31,7 +30,7 @@ def run(quick: bool = False) -> list[dict]:
     scene = engine_scene()
     caster, model, data = RayCaster(scene), *_mujoco_scene(scene)
     frame, repeats, rows = _fans(1), 2 if quick else 10, []
-    with _one_core():
+    with one_core():
         for name, fan, slow_repeats in (("rays, frame", frame, repeats), ("rays, sub-rays", _fans(4), 2)):
             ours = _ours(caster, *fan)
             rows.append(_compare(name, ours, "Open3D RaycastingScene", _open3d(scene, *fan), 5 * repeats))
@@ -157,17 +156,6 @@ def _body(origins: np.ndarray, rays: np.ndarray) -> tuple[Action, str, Action]:
     mujoco.mj_forward(model, data)
     rays = np.ascontiguousarray(rays)
     return lambda: cast_capsules(origins, rays, capsules), "mj_multiRay", _multi_ray(model, data, origins, rays)
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    """Confine the process to one of its cores: libraries that would use threads share it."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(cores)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
 
 
 def _compare(name: str, ours: Action, peer: str, theirs: Action, repeats: int) -> dict:

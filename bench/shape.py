@@ -13,14 +13,13 @@ behave best, and `trust-constr` to its own default tolerances.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from time import perf_counter
 
 import numpy as np
 from scipy.optimize import Bounds, least_squares, minimize
 
+from continuum_loc.evaluation.bench import one_core
 from continuum_loc.robot import RobotDescription, load_robot
 from continuum_loc.shape import ShapeEstimator, ShapeSettings
 from continuum_loc.shape.magnet import field_and_gradient
@@ -40,7 +39,7 @@ def run(quick: bool = False) -> list[dict]:
     robot = load_robot("hall_arm")
     solver = PositionSolver(robot.magnet, np.array([robot.sensor_arclength(sensor.name) for sensor in robot.hall]))
     problems = list(_problems(robot, 4 if quick else 12))
-    with _one_core():
+    with one_core():
         rows = [_whole_estimate(robot, 2 if quick else 6)]
         rows += [_compare(solver, f"shape, three positions, {name}", name, peer, problems, 3 if quick else 9)
                  for name, peer in (("trust-constr", _trust_constr(solver)), ("least_squares", _least_squares(solver)))]
@@ -131,17 +130,6 @@ def _compare(solver: PositionSolver, name: str, peer: str, theirs: Solve,
     return {"name": name, "ours_s": float(np.median(times[:, 0])), "peer": f"SciPy {peer}",
             "peer_s": float(np.median(times[:, 1])), "ratio": float(np.median(ratio)),
             "spread": [float(low), float(high)], "agreement_m": float(max(gaps))}
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    """Confine the process to one of its cores."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(cores)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
 
 
 if __name__ == "__main__":

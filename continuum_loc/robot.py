@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
-from continuum_loc.settings import Settings, SettingsError, load_settings
+from continuum_loc.settings import Settings, load_bundled
 
 ROBOTS_FOLDER = Path(__file__).parent / "robots"
 
@@ -277,11 +277,4 @@ class RobotDescription(Settings):
 
 def load_robot(name_or_path: str | Path) -> RobotDescription:
     """A robot that comes with the package (`engine`, `soft_arm`, `hall_arm`), or one of your own from a YAML file."""
-    path = Path(name_or_path)
-    if path.suffix in (".yaml", ".yml"):
-        return load_settings(RobotDescription, path)
-    bundled = ROBOTS_FOLDER / f"{name_or_path}.yaml"
-    if not bundled.is_file():
-        names = ", ".join(sorted(file.stem for file in ROBOTS_FOLDER.glob("*.yaml")))
-        raise SettingsError(f"no robot '{name_or_path}': give a .yaml file, or one of {names}")
-    return load_settings(RobotDescription, bundled)
+    return load_bundled(RobotDescription, ROBOTS_FOLDER, name_or_path, "robot")

@@ -39,6 +39,21 @@ def load_settings(model: type[S], path: str | Path) -> S:
     return parse_settings(model, data if data is not None else {}, where=str(path))
 
 
+def load_bundled(model: type[S], folder: Path, name_or_path: str | Path, what: str) -> S:
+    """Settings that come with the package as `folder/NAME.yaml`, or from a YAML file of one's own.
+
+    what: what it is, for the error. Raises SettingsError listing the names that there are.
+    """
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml"):
+        return load_settings(model, path)
+    bundled = folder / f"{name_or_path}.yaml"
+    if not bundled.is_file():
+        names = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
+        raise SettingsError(f"no {what} '{name_or_path}': give a .yaml file, or one of {names}")
+    return load_settings(model, bundled)
+
+
 def parse_settings(model: type[S], data: Any, where: str = "settings") -> S:
     """Validate a mapping into `model`. `where` starts each line of the error."""
     if not isinstance(data, dict):

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from continuum_loc.robot import Vector6
-from continuum_loc.settings import Settings, SettingsError, load_settings
+from continuum_loc.settings import Settings, load_bundled
 
 PRESETS_FOLDER = Path(__file__).parent / "presets"
 
@@ -151,11 +151,4 @@ def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSe
 
 def load_estimator_settings(name_or_path: str | Path) -> EstimatorSettings:
     """Settings that come with the package by the robot's name (`engine`, `soft_arm`), or from a YAML file."""
-    path = Path(name_or_path)
-    if path.suffix in (".yaml", ".yml"):
-        return load_settings(EstimatorSettings, path)
-    bundled = PRESETS_FOLDER / f"{name_or_path}.yaml"
-    if not bundled.is_file():
-        names = ", ".join(sorted(file.stem for file in PRESETS_FOLDER.glob("*.yaml")))
-        raise SettingsError(f"no estimator settings '{name_or_path}': give a .yaml file, or one of {names}")
-    return load_settings(EstimatorSettings, bundled)
+    return load_bundled(EstimatorSettings, PRESETS_FOLDER, name_or_path, "estimator settings")

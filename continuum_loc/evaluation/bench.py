@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +27,17 @@ from continuum_loc.evaluation.study import Claim, at_least, at_most, write_study
 BENCH_FOLDER = Path(__file__).parents[2] / "bench"
 BASELINE = BENCH_FOLDER / "baseline.json"
 SLACK = 0.25  # a ratio may fall by this share, or out of both runs' quartiles, whichever is more, before it counts
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Confine the process to one of its cores: libraries that would use threads share it."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 class BenchError(ValueError):

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from continuum_loc.robot import RobotDescription
-from continuum_loc.settings import Settings, SettingsError, load_settings
+from continuum_loc.settings import Settings, SettingsError, load_bundled
 
 PLANTS_FOLDER = Path(__file__).parent / "plants"
 
@@ -110,14 +110,7 @@ def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.nda
 
 def load_plant(name_or_path: str | Path) -> PlantSettings:
     """The plant of a bundled robot (by the robot's name), or one of your own from a YAML file."""
-    path = Path(name_or_path)
-    if path.suffix in (".yaml", ".yml"):
-        return load_settings(PlantSettings, path)
-    bundled = PLANTS_FOLDER / f"{name_or_path}.yaml"
-    if not bundled.is_file():
-        names = ", ".join(sorted(file.stem for file in PLANTS_FOLDER.glob("*.yaml")))
-        raise SettingsError(f"no plant '{name_or_path}': give a .yaml file, or one of {names}")
-    return load_settings(PlantSettings, bundled)
+    return load_bundled(PlantSettings, PLANTS_FOLDER, name_or_path, "plant")
 
 
 def node_arclengths(robot: RobotDescription, plant: PlantSettings, link_length: float) -> np.ndarray:
