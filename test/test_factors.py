@@ -11,14 +11,14 @@ from continuum_loc.estimator.factors import FACTORS, MeasurementError, TofFactor
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Grid, column_at_rest
 from continuum_loc.mapping.voxel_index import VoxelIndex
-from continuum_loc.measurements import EncoderSample, ImuSample, StrainSample, TofFrame, TrackedPose
+from continuum_loc.measurements import EncoderSample, FieldSample, ImuSample, StrainSample, TofFrame, TrackedPose
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 
 DT = 0.1
 LOOSE = {"cauchy": 1e6}  # the loss is frozen per iteration, so only the quadratic part has a gradient to compare
 SETTINGS = parse_settings(EstimatorSettings, {
-    "gyro": LOOSE, "strain": LOOSE, "tracker": LOOSE,
+    "gyro": LOOSE, "field": LOOSE, "strain": LOOSE, "tracker": LOOSE,
     # A floor that drowns the beam's own noise, whose share across the surface turns with the body.
     "tof": {**LOOSE, "gate": 1.0, "min_cosine": 0.0, "floor": 100.0},
     "gravity": {"enabled": True, "gate": 100.0}})
@@ -29,6 +29,8 @@ def robot() -> RobotDescription:
     mount = {"xyz": [0.01, 0.0, 0.005], "rpy_deg": [10.0, 20.0, 5.0]}
     data["trackers"] = [{"name": "coil", "ring": "r2", "mount": mount}]
     data["base"]["insertion"] = {"mode": "measured", "range": [0.0, 0.5], "sigma": 0.001}
+    data["magnet"] = {"remanence": 1.1}
+    data["hall"] = [{"name": "r1_hall", "ring": "r1"}]
     return parse_settings(RobotDescription, data)
 
 
@@ -50,6 +52,8 @@ def measurements(kind: str, description: RobotDescription):
         return [s for s in samples if isinstance(s, StrainSample)]
     if kind == "tof":
         return [s for s in samples if isinstance(s, TofFrame)][:7]
+    if kind == "field":
+        return [FieldSample(EPOCH, "r1_hall", 1e-6 * rng.normal(size=3)) for _ in range(4)]
     if kind == "tracker":
         A = rng.normal(size=(6, 6))
         covariance = 1e-4 * (A @ A.T + np.eye(6))
@@ -65,7 +69,7 @@ def make_factor(kind: str, description: RobotDescription, grid: Grid):
     return factor(description, grid, SETTINGS)
 
 
-@pytest.mark.parametrize("kind", ["gyro", "strain", "tof", "tracker", "insertion", "gravity"])
+@pytest.mark.parametrize("kind", ["gyro", "strain", "tof", "tracker", "insertion", "gravity", "field"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
     description = robot()
@@ -91,7 +95,7 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
         assert slope == pytest.approx(blocks.g @ x, abs=1e-5 * scale + 1e-6 * abs(slope))
 
 
-@pytest.mark.parametrize("kind", ["gyro", "strain", "tof", "tracker", "insertion", "gravity"])
+@pytest.mark.parametrize("kind", ["gyro", "strain", "tof", "tracker", "insertion", "gravity", "field"])
 def test_hessian_is_symmetric_and_positive_semidefinite(kind):
     description = robot()
     grid = Grid(description, 0.16)

@@ -48,6 +48,16 @@ def body_between(a: Column, b: Column, time: float) -> Body:
     return Body(T, (1.0 - u) * a.strain + u * b.strain, velocity)
 
 
+def interpolated_poses(a: Column, b: Column, tau: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (m, 4, 4) of `nodes` (m,) at times tau (m,) after column a, and their Jacobians (m, 6, 24) by
+    [delta_a, v_a, delta_b, v_b] of the node."""
+    m = len(nodes)
+    T, J_pose = np.empty((m, 4, 4)), np.empty((m, 6, 24))
+    _interpolate(a.T, a.velocity, b.T, b.velocity, b.time - a.time, tau, nodes, nodes, T, np.empty((m, 6)), J_pose,
+                 np.empty((m, 6, 24)))
+    return T, J_pose
+
+
 def motion_jacobians(a: Column, b: Column, time: float, nodes: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
     """Jacobians A, B (12 m, D) of [pose, velocity] of `nodes` (m,) at `time`, by the offsets of the two columns."""
     m, d, tau = len(nodes), b.time - a.time, time - a.time

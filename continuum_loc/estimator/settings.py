@@ -85,6 +85,16 @@ class GravitySettings(Settings):
     up: tuple[float, float, float] = Field((0.0, 0.0, 1.0), description="direction against gravity in `map`")
 
 
+class FieldSettings(Settings):
+    """Hall sensors in the field of the magnet at the base."""
+
+    enabled: bool = True
+    scale: float = Field(1.0, gt=0.0, description="factor on the datasheet's noise")
+    share: float = Field(0.005, ge=0.0, description="share of the field that counts as noise: magnet, mounts, model")
+    cauchy: float = Field(10.0, gt=0.0, description="scale of the Cauchy loss in sigmas")
+    earth: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="Earth's field in `map` [T]")
+
+
 class SolverSettings(Settings):
     """Gauss-Newton with damping."""
 
@@ -136,6 +146,7 @@ class EstimatorSettings(Settings):
     strain: StrainSettings = StrainSettings()
     tracker: TrackerSettings = TrackerSettings()
     gravity: GravitySettings = GravitySettings()
+    field: FieldSettings = FieldSettings()
     solver: SolverSettings = SolverSettings()
     recovery: RecoverySettings = RecoverySettings()
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError
+from continuum_loc.estimator.factors.field import FieldFactor
 from continuum_loc.estimator.factors.gravity import GravityFactor
 from continuum_loc.estimator.factors.gyro import GyroFactor
 from continuum_loc.estimator.factors.pose import InsertionFactor, TrackerFactor
 from continuum_loc.estimator.factors.strain import StrainFactor
 from continuum_loc.estimator.factors.tof import TofFactor
 
-FACTORS: tuple[type[Factor], ...] = (GyroFactor, StrainFactor, TrackerFactor, InsertionFactor, GravityFactor)
+FACTORS: tuple[type[Factor], ...] = (GyroFactor, StrainFactor, TrackerFactor, InsertionFactor, GravityFactor,
+                                    FieldFactor)
 
 __all__ = ["FACTORS", "Factor", "FactorReport", "MeasurementError", "TofFactor"]
