@@ -224,8 +224,9 @@ def test_a_frozen_sensor_is_refused_and_a_wrong_extrinsic_named(prior_map):
 
 
 def test_field_gravity_and_gyros_track_the_hall_arm():
-    """The arm of the second paper, bent freely by its tendons: no map, no strain, only the magnet at its base. Told
-    Earth's field it is good to 0.2 mm; not told, it is wrong by ten times that, as Earth's is a tenth of the magnet's."""
+    """The arm of the second paper, bent freely by its tendons: no map, no strain, only the magnet at its base.
+
+    Told Earth's field it is good to 0.2 mm; not told, ten times worse, as Earth's is a tenth of the magnet's."""
     robot = load_robot("hall_arm")
     world = World(robot, None, "free1", seed=3)
     samples = list(world.run(4.0))
