@@ -18,7 +18,8 @@ import numpy as np
 from continuum_loc.evaluation.bench import one_core
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.raycast import RayCaster, cast_capsules
-from continuum_loc.simulator.scenes import Scene, load_scene, scene_of_solid
+from continuum_loc.simulator.scene import Scene, scene_of_solid
+from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.solids import Part, solid_of
 
 FACES = 150_000

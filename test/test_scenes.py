@@ -10,7 +10,8 @@ from continuum_loc.robot import load_robot
 from continuum_loc.simulator import convex, mesh_import, scene_cache
 from continuum_loc.simulator.mesh_import import check_mesh
 from continuum_loc.simulator.raycast import RayCaster
-from continuum_loc.simulator.scenes import Anomaly, Scene, SceneError, load_scene
+from continuum_loc.simulator.scene import Anomaly, Scene, SceneError
+from continuum_loc.simulator.scenes import load_scene
 
 VARIANTS = ("S2", "S5", "S9")  # one of each kind: added objects, missing features, both
 CUBE = trimesh.creation.box((1.0, 1.0, 1.0))

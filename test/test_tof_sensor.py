@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from continuum_loc.robot import TofModel, load_robot
 from continuum_loc.simulator.raycast import RayCaster, cast_capsules
-from continuum_loc.simulator.scenes import Scene, load_scene
+from continuum_loc.simulator.scene import Scene
+from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.tof import Echoes, TofSensorModel
 from continuum_loc.simulator.vl53l5cx import Vl53l5cxReceiver, Vl53l5cxSettings
 

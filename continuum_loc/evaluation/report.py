@@ -84,7 +84,8 @@ def context_of(run: Run) -> Context:
     from continuum_loc.evaluation.trials import scene_map
     from continuum_loc.mapping.errors import MapError
     from continuum_loc.mapping.prior_map import load_map
-    from continuum_loc.simulator.scenes import SceneError, load_scene
+    from continuum_loc.simulator.scene import SceneError
+    from continuum_loc.simulator.scenes import load_scene
 
     mesh = map_points = None
     named = run.configuration.get("map") or {}

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from continuum_loc.simulator.scenes import Anomaly, Scene, scene_of_solid
+from continuum_loc.simulator.scene import Anomaly, Scene, scene_of_solid
 from continuum_loc.simulator.solids import Part, box, loft, mesh_of, unite, vertices_of
 
 WIDTH, DEPTH, HEIGHT = 0.70, 0.70, 0.60

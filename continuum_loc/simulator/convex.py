@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from continuum_loc.simulator.scenes import SceneError
+from continuum_loc.simulator.scene import SceneError
 
 _MODES = ("auto", "on")  # preprocessing: only if the mesh needs it; or always, by a coarse remeshing that never fails
 _THRESHOLD = {"auto": 0.02, "on": 0.05}  # concavity, as a share of the mesh's size

@@ -13,7 +13,7 @@ import numpy as np
 from manifold3d import Manifold
 
 from continuum_loc.simulator.engine_mesh import bitten, casing_radius, engine_parts, hub_radius, leading_edge
-from continuum_loc.simulator.scenes import Anomaly, Scene, scene_of_solid
+from continuum_loc.simulator.scene import Anomaly, Scene, scene_of_solid
 from continuum_loc.simulator.solids import Part, box, cylinder, mesh_of, on_cylinder, unite, vertices_of
 
 _EMBED = 0.004  # objects sink this far into what carries them, so that the union leaves no crack [m]

@@ -8,8 +8,8 @@ import numpy as np
 
 from continuum_loc.simulator import convex
 from continuum_loc.simulator.convex import convex_pieces
+from continuum_loc.simulator.scene import Scene, SceneError
 from continuum_loc.simulator.scene_cache import cached_scene
-from continuum_loc.simulator.scenes import Scene, SceneError
 
 _SMALLEST, _LARGEST = 0.05, 50.0  # a continuum robot's surroundings, longest edge [m]
 _REFLECTANCE = 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from continuum_loc.simulator.scenes import Scene
+from continuum_loc.simulator.scene import Scene
 
 
 class RayCaster:

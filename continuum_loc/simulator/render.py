@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from continuum_loc.robot import RobotDescription, load_robot
-from continuum_loc.simulator.scenes import Scene, load_scene
+from continuum_loc.simulator.scene import Scene
+from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.world import World
 
 BODY, RING, SENSOR = (0.93, 0.55, 0.20), (0.25, 0.27, 0.30), (0.98, 0.85, 0.15)

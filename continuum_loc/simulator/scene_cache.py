@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from continuum_loc.simulator.scenes import Anomaly, Scene
+from continuum_loc.simulator.scene import Anomaly, Scene
 
 
 def cached_scene(name: str, made_from: Iterable[Path], build: Callable[[], Scene]) -> Scene:

@@ -1,4 +1,4 @@
-"""Scenes: what surrounds the robot, as a mesh for sensors and convex pieces for contact.
+"""Scenes by name or file.
 
 `load_scene("S0")` ... `"S9"` are the engine of the paper (as built, with added objects, with missing features, with
 both), `"R0"` ... `"R4"` the box with none to four objects; anything else is the path of your own mesh.
@@ -6,81 +6,15 @@ both), `"R0"` ... `"R4"` the box with none to four objects; anything else is the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-if TYPE_CHECKING:
-    from manifold3d import Manifold
-
-    from continuum_loc.simulator.solids import Part
+from continuum_loc.simulator.scene import Scene, SceneError
 
 ENGINE_SCENES = tuple(f"S{i}" for i in range(10))
 BOX_SCENES = tuple(f"R{i}" for i in range(5))
 SCENE_NAMES = ENGINE_SCENES + BOX_SCENES
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
-
-
-class SceneError(ValueError):
-    """A scene that cannot be used; the message says what is wrong with it and what to change."""
-
-
-@dataclass(frozen=True, eq=False)
-class Anomaly:
-    """What a scene has that its as-built version has not (`added`), or the other way round (`missing`).
-
-    `vertices` (V, 3) and `faces` (F, 3) bound the solid that was added or taken away, in the map frame.
-    """
-
-    name: str
-    kind: Literal["added", "missing"]
-    vertices: np.ndarray
-    faces: np.ndarray
-
-    @cached_property
-    def centre(self) -> np.ndarray:
-        """(3,) centre of the bounding box [m]."""
-        return 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
-
-    @cached_property
-    def size(self) -> float:
-        """Longest edge of the bounding box [m]."""
-        return float(np.ptp(self.vertices, axis=0).max())
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A watertight environment in the map frame.
-
-    vertices: (V, 3) float64 [m]. faces: (F, 3) int32, counter-clockwise seen from free space.
-    face_object: (F,) int32, index into `objects` of the part that each face belongs to.
-    reflectance: (F,) share of infrared light that a face reflects at normal incidence.
-    hulls: (n, 3) vertices of each convex piece within the robot's reach, for contact.
-    anomalies: how the scene departs from its as-built version.
-    """
-
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    face_object: np.ndarray
-    objects: tuple[str, ...]
-    reflectance: np.ndarray
-    hulls: tuple[np.ndarray, ...]
-    anomalies: tuple[Anomaly, ...] = field(default=())
-
-    def __post_init__(self) -> None:
-        for array in (self.vertices, self.faces, self.face_object, self.reflectance):
-            array.setflags(write=False)  # scenes are cached and shared
-
-    @cached_property
-    def face_normals(self) -> np.ndarray:
-        """(F, 3) unit normals, towards free space."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        normals = np.cross(b - a, c - a)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -101,20 +35,9 @@ def load_scene(name_or_path: str | Path) -> Scene:
 
 @lru_cache(maxsize=4)
 def _built(name: str) -> Scene:
-    from continuum_loc.simulator import box, engine_mesh, engine_variants, scene_cache, solids
+    from continuum_loc.simulator import box, engine_mesh, engine_variants, scene, scene_cache, solids
 
     if name in BOX_SCENES:
         return box.box_scene(name)
-    sources = (Path(module.__file__) for module in (engine_mesh, engine_variants, solids, scene_cache))
+    sources = (Path(module.__file__) for module in (scene, engine_mesh, engine_variants, solids, scene_cache))
     return scene_cache.cached_scene(name, [Path(__file__), *sources], lambda: engine_variants.engine_variant(name))
-
-
-def scene_of_solid(name: str, solid: Manifold, owners: np.ndarray, parts: list[Part],
-                   anomalies: tuple[Anomaly, ...] = ()) -> Scene:
-    """The scene of united parts; `owners` (F,) is the index of each face's part (see `solids.unite`)."""
-    from continuum_loc.simulator.solids import mesh_of
-
-    vertices, faces = mesh_of(solid)
-    reflectance = np.array([part.reflectance for part in parts])[owners]
-    hulls = tuple(hull for part in parts for hull in part.hulls)
-    return Scene(name, vertices, faces, owners, tuple(part.name for part in parts), reflectance, hulls, anomalies)

@@ -27,7 +27,7 @@ from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclen
 from continuum_loc.simulator.trajectories import Trajectory, trajectory
 
 if TYPE_CHECKING:
-    from continuum_loc.simulator.scenes import Scene
+    from continuum_loc.simulator.scene import Scene
 
 TRUTH_RATE = 100.0
 ENCODER_RATE = 50.0
