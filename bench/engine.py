@@ -18,7 +18,7 @@ from continuum_loc.evaluation.trials import Trial, make_filter, scene_map, simul
 from continuum_loc.measurements import Measurement
 from continuum_loc.robot import load_robot
 
-# The issue's: a real-time factor of 5, and half a ToF period.
+# What is meant to hold: a real-time factor of 5, and half a ToF period.
 BOUNDS = [("engine, a second of data", "ours_s", "at most", 0.2), ("engine, step p99", "ours_s", "at most", 0.033)]
 SIZES = {"window": (0.5, 1.0, 2.0), "node_spacing": (0.32, 0.16, 0.08)}
 MAPS = (30_000, 300_000, 3_000_000)

@@ -49,7 +49,7 @@ COLD = {"cold": NO_STRAIN, "cold, no recovery": NO_STRAIN | NO_RECOVERY}
 COLD_STARTS = (5.0, 9.0, 12.0, 15.0)  # s into a trial, when the robot is bent
 COLD_LENGTH = 3.0  # s
 FOUND = 0.02  # m: with every ring closer than this a cold start has found itself
-UNANNOUNCED = 1.0  # s: the issue's limit for a ring that is off without a word
+UNANNOUNCED = 1.0  # s: the limit for a ring that is off without a word
 
 TEXT = """
 The paper says of its strain sensor alone that it "does not provide enough information for accurate localization,
@@ -120,7 +120,7 @@ def as_mapped(result: CaseResult) -> bool:
 
 
 def judge(warm: Sequence[CaseResult], cold: Sequence[CaseResult]) -> list[Claim]:
-    """The issue's bound for trials without strain, and the paper's two claims as figures."""
+    """The bound for trials without strain, and the paper's two claims as figures."""
     groups = by_name(warm) | by_name(cold)
     claims = [at_most(f"{name}: longest time a ring is off unannounced",
                       max(longest_unannounced(result) for result in groups[name]), "s", UNANNOUNCED)

@@ -68,7 +68,7 @@ def trials(quick: bool, seed: int) -> list[Trial]:
 
 
 def judge(robot: str, found: Errors) -> list[Claim]:
-    """The issue's bounds, over all rings and for each."""
+    """The bounds, over all rings and for each."""
     claims = []
     for name, ring in columns(found):
         known = honesty(found, ring)

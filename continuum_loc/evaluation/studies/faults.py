@@ -33,7 +33,7 @@ from continuum_loc.simulator.faults import ClockOffset, Dropout, Fault, Freeze, 
 
 START, LENGTH, AFTER = 8.0, 2.0, 3.0  # s
 QUICK_START = 1.5  # s
-BACK = 1.0  # s: the limit for being back to normal
+BACK = 1.0  # s: the limit for being back to normal
 NORMAL_MARGIN = 1.25
 CLEAN = "no fault"
 

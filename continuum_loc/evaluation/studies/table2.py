@@ -44,7 +44,7 @@ def trials(quick: bool, seed: int) -> list[Trial]:
 
 
 def judge(outcomes: list[Outcome]) -> list[Claim]:
-    """The bounds of the issue, over every trial but the hold-out that the filter was tuned on."""
+    """The bounds, over every trial but the hold-out that the filter was tuned on."""
     judged = [outcome for outcome in outcomes if not is_hold_out(outcome.trial)]
     require_unseen([outcome.trial for outcome in judged])
     by_scene = {scene: [outcome for outcome in judged if outcome.trial.scene == scene]

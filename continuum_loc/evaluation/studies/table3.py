@@ -58,7 +58,7 @@ def of_fidelity(outcomes: list[Outcome], fidelity: str) -> list[Outcome]:
 
 
 def judge(outcomes: list[Outcome]) -> list[Claim]:
-    """The issue's bounds, without the hold-out that the filter was tuned on."""
+    """The bounds, without the hold-out that the filter was tuned on."""
     judged = [outcome for outcome in outcomes if not is_hold_out(outcome.trial)]
     require_unseen([outcome.trial for outcome in judged])
     claims = []
