@@ -6,13 +6,12 @@ step costs with longer windows, more nodes and larger maps. Nothing comparable e
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
+from continuum_loc.evaluation.bench import one_core
 from continuum_loc.evaluation.replay import ReplayResult, replay
 from continuum_loc.evaluation.trials import Trial, make_filter, scene_map, simulate
 from continuum_loc.measurements import Measurement
@@ -28,7 +27,7 @@ def run(quick: bool = False) -> list[dict]:
     """Rows of name and ours_s; the first replay, which may compile, is not counted."""
     samples = list(simulate(Trial("engine", "S0", "t2", duration=4.0 if quick else 20.0)))
     settings = load_estimator_settings("engine")
-    with _one_core():
+    with one_core():
         _replayed(samples[: len(samples) // 8], settings)
         result = _replayed(samples, settings)
         rows = [_row("engine, a second of data", 1.0 / result.real_time_factor),
@@ -60,13 +59,3 @@ def _median_step(result: ReplayResult) -> float:
 
 def _row(name: str, seconds: float) -> dict:
     return {"name": name, "ours_s": seconds, "peer": None, "peer_s": None, "ratio": None, "spread": None}
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)

@@ -24,7 +24,7 @@ from continuum_loc.estimator.recovery import Recovery, place
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Grid, column_at_rest
-from continuum_loc.estimator.window import TIME_EPSILON, Window
+from continuum_loc.estimator.window import TIME_EPSILON, Fit, Window
 from continuum_loc.measurements import Measurement, TofFrame, nanoseconds, seconds
 from continuum_loc.robot import RobotDescription
 
@@ -111,13 +111,13 @@ class SlidingWindowFilter:
         with self._threads.limit(limits=1, user_api="blas"):
             self.window.mark_changed()
             iterations, converged = self.recovery.acquire()
-            out = []
+            fit, out = self.window.fit(), []
             for stamp in stamps:
                 time = seconds(stamp, self.epoch)
                 if not first - TIME_EPSILON <= time <= last + TIME_EPSILON:
                     raise ValueError(f"stamp {stamp} is outside the window, {self.epoch + nanoseconds(first)} to "
                                      f"{self.newest} ns")
-                out.append(self._compose(time, iterations, converged, started, None))
+                out.append(self._compose(time, fit, iterations, converged, started, None))
         return out
 
     def _admit(self, measurement: Measurement) -> bool:
@@ -216,14 +216,14 @@ class SlidingWindowFilter:
     def _estimate(self, iterations: int, converged: bool, started: float) -> Estimate:
         now = seconds(self._output, self.epoch)
         before = now - self.settings.lag
-        lagged = None
+        lagged, fit = None, self.window.fit()
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
-            lagged = self._compose(before, iterations, converged, started, None)
-        return self._compose(now, iterations, converged, started, lagged)
+            lagged = self._compose(before, fit, iterations, converged, started, None)
+        return self._compose(now, fit, iterations, converged, started, lagged)
 
-    def _compose(self, time: float, iterations: int, converged: bool, started: float,
+    def _compose(self, time: float, fit: Fit, iterations: int, converged: bool, started: float,
                  lagged: Estimate | None) -> Estimate:
-        rings, body, fit = self.grid.ring_nodes, self.window.body(time), self.window.fit()
+        rings, body = self.grid.ring_nodes, self.window.body(time)
         covariance = self.window.motion_covariance(time, rings)
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))

@@ -13,7 +13,7 @@ from continuum_loc.estimator.output import BodyState, body_between
 from continuum_loc.estimator.state import NODE_DIM, POSE, STRAIN, VELOCITY, Column, Grid
 from continuum_loc.estimator.window import TIME_EPSILON, Window
 
-SMOOTHED_BY = 3  # knots
+SMOOTHED_BY = 2  # knots
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -186,8 +186,9 @@ class Window:
     def _move(self, offsets: list[np.ndarray]) -> int:
         """Take the offsets; columns that moved far get a new linearisation point. The first interval affected."""
         first = len(self.intervals)
+        far = self._pose_moves(offsets) >= self.settings.solver.relinearise
         for k, offset in enumerate(offsets):
-            if (k == 0 and self.pinned) or np.max(np.abs(self._poses(offset))) < self.settings.solver.relinearise:
+            if (k == 0 and self.pinned) or not far[k]:
                 self.offsets[k] = offset
                 continue
             self.columns[k] = self.columns[k].retract(offset)
@@ -210,11 +211,12 @@ class Window:
             self.chain.messages[0] = self._start_message()
 
     def _largest_move(self, offsets: list[np.ndarray]) -> float:
-        changes = (new - old for new, old in zip(offsets, self.offsets, strict=True))
-        return max(float(np.max(np.abs(self._poses(change)))) for change in changes)
+        return float(np.max(self._pose_moves(np.array(offsets) - np.array(self.offsets))))
 
-    def _poses(self, offset: np.ndarray) -> np.ndarray:
-        return offset[:self.grid.bias_offset].reshape(-1, NODE_DIM)[:, :6]
+    def _pose_moves(self, offsets: list[np.ndarray] | np.ndarray) -> np.ndarray:
+        """(K,) largest pose component [m, rad] of each column's offset."""
+        nodes = np.asarray(offsets)[:, :self.grid.bias_offset].reshape(len(offsets), -1, NODE_DIM)
+        return np.abs(nodes[:, :, :6]).max(axis=(1, 2))
 
     def _cost(self) -> float:
         """Robust cost where linearised, and by the quadratic model at the offsets."""
