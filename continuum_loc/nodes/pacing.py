@@ -24,6 +24,7 @@ class Paced:
         self._items, self._lookahead, self._rate = items, lookahead, rate
         self._queue: Queue[Any] = Queue(maxsize=4000)
         self._stop = threading.Event()
+        self._full = threading.Event()  # the first lookahead is prepared, or all there is
         self._progress: int | None = None  # data stamp delivered last, at first the first
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._prepare, name="lookahead", daemon=True)
@@ -33,9 +34,11 @@ class Paced:
         """Deliver everything, then return; `stop` from another thread ends it early.
 
         `deliver(stamp, item, delay)`: delay [s] behind the item's time. `on_start(first stamp)` is called when the
-        first item is prepared, and due one lookahead from now.
+        first lookahead is prepared (what compiles at its first use has then compiled) and due one lookahead from now.
         """
         self._thread.start()
+        while not self._full.wait(POLL) and not self._stop.is_set():
+            pass
         begin: float | None = None
         for stamp, item in self._prepared():
             if begin is None:
@@ -77,17 +80,20 @@ class Paced:
                     return
         except BaseException as error:  # handed to the thread that delivers
             self._error = error
+        self._full.set()
         self._put(_END, 0)
 
     def _put(self, entry: Any, stamp: int) -> bool:
         ahead = self._lookahead * self._rate * NANOSECONDS
         self._progress = stamp if self._progress is None else self._progress
         while stamp - self._progress > ahead and not self._stop.is_set():
+            self._full.set()
             time.sleep(0.002)
         while not self._stop.is_set():
             try:
                 self._queue.put(entry, timeout=POLL)
                 return True
             except Full:
+                self._full.set()
                 continue
         return False

@@ -20,24 +20,31 @@ from continuum_loc.measurements import (
 )
 from continuum_loc.robot import RobotDescription
 
+NOISE = 1e-4  # m, rad/s
+
 
 def rest_samples(robot: RobotDescription, duration: float, start: int = NANOSECONDS) -> Iterator[Measurement]:
-    """Samples in order of their stamps of a straight robot that rests in a tube of 0.5 m."""
+    """Samples in order of their stamps of a straight robot that rests in a tube of 0.5 m, with a little seeded noise:
+    a sensor that repeats itself to the last bit is refused as frozen."""
+    rng = np.random.default_rng(0)
     tick = 1.0 / max(robot.imu_model.rate, 1.0)
     for step in range(round(duration / tick)):
         stamp = start + nanoseconds(step * tick)
-        yield from _inertial(robot, stamp)
+        yield from _inertial(robot, stamp, rng)
         if robot.base.insertion.mode == "measured":
             yield EncoderSample(stamp, ("insertion",), np.zeros(1), np.zeros(1))
         if _due(step, tick, robot.strain.rate if robot.strain else 0.0):
             s = robot.strain_stations
             yield StrainSample(stamp, s, np.zeros_like(s), np.zeros_like(s))
         if _due(step, tick, robot.tof_model.rate):
-            yield from _frames(robot, stamp)
+            yield from _frames(robot, stamp, rng)
 
 
 def warm_up(filter_: Any, robot: RobotDescription, window: float) -> None:
-    """Compile every kernel that `filter_` uses by running it past its first marginalisation, then reset it."""
+    """Compile every kernel that `filter_` uses by running it past its first marginalisation, then reset it.
+
+    The tube is not what the map shows, so that the search for a lost body runs, and compiles, too.
+    """
     for sample in rest_samples(robot, 1.3 * window + 0.3):
         filter_.process(sample)
     filter_.flush()
@@ -48,16 +55,16 @@ def _due(step: int, tick: float, rate: float) -> bool:
     return int((step + 1) * tick * rate + 1e-9) > int(step * tick * rate + 1e-9)
 
 
-def _inertial(robot: RobotDescription, stamp: int) -> Iterator[Measurement]:
+def _inertial(robot: RobotDescription, stamp: int, rng: np.random.Generator) -> Iterator[Measurement]:
     for sensor in robot.imu:
-        yield ImuSample(stamp, sensor.name, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+        yield ImuSample(stamp, sensor.name, NOISE * rng.normal(size=3), np.array([0.0, 0.0, 9.81]))
     for sensor in robot.hall:
         yield FieldSample(stamp, sensor.name, np.array([1e-4, 0.0, 0.0]))
 
 
-def _frames(robot: RobotDescription, stamp: int) -> Iterator[TofFrame]:
+def _frames(robot: RobotDescription, stamp: int, rng: np.random.Generator) -> Iterator[TofFrame]:
     rays = robot.tof_model.directions
-    ranges = np.full(len(rays), 0.5)
     for sensor in robot.tof:
-        yield TofFrame(stamp, sensor.name, 0.5 * rays, ranges, robot.tof_model.sigma(ranges),
+        ranges = 0.5 + NOISE * rng.normal(size=len(rays))
+        yield TofFrame(stamp, sensor.name, ranges[:, None] * rays, ranges, robot.tof_model.sigma(ranges),
                        np.full(len(rays), TOF_VALID, np.uint8))
