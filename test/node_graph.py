@@ -46,6 +46,9 @@ imu: [{name: imu1, ring: ring1}, {name: imu2, ring: ring2}]
 BOX = np.array([[-0.2, -0.3, -0.3], [0.6, 0.3, 0.3]])
 
 
+MATCHED = 0.5  # s: the other side learns of a subscription about when this side learns of the publisher
+
+
 def fresh_domain() -> int:
     """A ROS_DOMAIN_ID that no other test of this run has."""
     return 1 + next(_numbers) % 100
@@ -140,6 +143,13 @@ class Client:
     def await_listeners(self, *topics: str, count: int = 1) -> None:
         assert self.until(lambda: all(self.publisher(t).get_subscription_count() >= count for t in topics)), \
             f"nobody listens to {topics}"
+
+    def await_speakers(self) -> None:
+        """Wait until somebody publishes on every topic that this client hears, and knows that it does: what is said
+        before that is lost."""
+        assert self.until(lambda: all(self.node.count_publishers(topic) > 0 for topic in self.heard)), \
+            f"nobody publishes one of {list(self.heard)}"
+        self.until(lambda: False, MATCHED)
 
     def call(self, kind, name: str, request):
         client = self.node.create_client(kind, name)

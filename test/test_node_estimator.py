@@ -50,6 +50,7 @@ def graph(box, tmp_path_factory):
         client.await_listeners(*INPUTS)
         for topic in OUTPUTS:
             client.hear(topic)
+        client.await_speakers()
         yield client, node, folder
     assert node.stop() == 0, node.log
 
@@ -239,6 +240,7 @@ def test_either_side_may_be_restarted(box, tmp_path):
                 for topic in INPUTS:
                     driver.publisher(topic)
                 driver.await_listeners(*INPUTS)
+                watcher.await_speakers()
                 poses.clear()
                 box.play(driver, 1.0)
                 assert watcher.until(lambda: poses), node.log
@@ -248,6 +250,7 @@ def test_either_side_may_be_restarted(box, tmp_path):
             for topic in INPUTS:
                 driver.publisher(topic)
             driver.await_listeners(*INPUTS)
+            watcher.await_speakers()
             poses.clear()
             box.play(driver, 1.0)
             assert watcher.until(lambda: poses), node.log
@@ -272,6 +275,7 @@ def test_two_robots_in_namespaces(box, tmp_path):
             client.publisher(topic)
         client.await_listeners(*INPUTS)
         mine, others = client.hear("poses"), other.hear("poses")
+        client.await_speakers()
         box.play(client, 1.0)
         assert client.until(lambda: mine)
         other.spin(0.2)
