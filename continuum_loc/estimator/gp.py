@@ -19,7 +19,7 @@ from continuum_loc import lie_kernels as lk
 
 
 @njit(cache=True)
-def _relative_twist(T_a, v_a, T_b, v_b, W, V, M):
+def _relative_twist(T_a, T_b, v_b, W, V, M):
     """xi in V[0], w = J_r(xi)^-1 v_b in V[3], J_r(xi)^-1 in W[1], J_l(xi)^-1 in W[2], dw/dxi in W[3]."""
     lk.relative(T_a, T_b, M[0])
     lk.log(M[0], V[0])
@@ -60,7 +60,7 @@ def hermite(T_a, v_a, T_b, v_b, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
 
     W, V, M come from `lie_kernels.workspace`, J_work is (2, 6, 24).
     """
-    _relative_twist(T_a, v_a, T_b, v_b, W, V, M)
+    _relative_twist(T_a, T_b, v_b, W, V, M)
     u = tau / d
     h1, h2, h3 = u * u * (3.0 - 2.0 * u), u * (1.0 - u) * (1.0 - u) * d, -u * u * (1.0 - u) * d
     g1, g2, g3 = 6.0 * u * (1.0 - u) / d, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)
@@ -95,7 +95,7 @@ def hermite(T_a, v_a, T_b, v_b, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
 @njit(cache=True)
 def motion_error(T_a, v_a, T_b, v_b, d, e, J, W, V, M):
     """Prior error e (12,) = [xi - d v_a; w - v_a] and its Jacobian J (12, 24)."""
-    _relative_twist(T_a, v_a, T_b, v_b, W, V, M)
+    _relative_twist(T_a, T_b, v_b, W, V, M)
     for i in range(6):
         e[i] = V[0, i] - d * v_a[i]
         e[6 + i] = V[3, i] - v_a[i]

@@ -122,7 +122,8 @@ class Recovery:
 
     def look_after(self, time: float, converged: bool) -> None:
         """Notice a wrong minimum by the worst ring's share of fitting zones, and look for a better body."""
-        misfits = self._misfits() + self._silent(time)
+        silent = self._silent(time)
+        misfits = self._misfits() + silent
         if self._tof is None or not self._settings.enabled:
             self.acquired = self.acquired or converged
             self._suspect(misfits)
@@ -130,7 +131,6 @@ class Recovery:
         # A ToF sensor that does not fit may be broken, or the body wrong: only a search that finds no better body
         # tells, so that only then it is a suspect and no longer counts.
         tof_names = {sensor.name for sensor in self._robot.tof}
-        silent = self._silent(time)
         self._suspect([name for name in misfits if name in self.suspects or name not in tof_names or name in silent])
         share = self._worst_share()
         fitting = share >= self._settings.suspect_share

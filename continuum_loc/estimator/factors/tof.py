@@ -63,10 +63,9 @@ class TofFactor(Factor):
                                                  f"the robot description says {model.rows} x {model.columns} zones")
         q, rays = np.empty(points.shape), np.empty(points.shape)
         variance = np.empty(len(points))
-        if _beams(points, np.asarray(measurement.status), T_ring_sensor, model.min_range, model.max_range,
-                  self._noise_distance, self._noise_coefficient, q, rays, variance) == 0:
-            return number, node, q, rays, variance, Association(len(points))
-        if self._repeats.frozen(measurement.sensor, points):
+        usable = _beams(points, np.asarray(measurement.status), T_ring_sensor, model.min_range, model.max_range,
+                        self._noise_distance, self._noise_coefficient, q, rays, variance)
+        if usable > 0 and self._repeats.frozen(measurement.sensor, points):
             raise MeasurementError("frozen", f"ToF sensor '{measurement.sensor}' repeats itself to the last bit")
         return number, node, q, rays, variance, Association(len(points))
 
