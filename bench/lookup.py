@@ -1,29 +1,31 @@
-"""Nearest-neighbour lookup in a map of 500,000 points, beside SciPy, Open3D, KISS-ICP and small_gicp.
+"""
+Nearest-neighbour lookup in a map of 500,000 points, beside SciPy, Open3D, KISS-ICP and small_gicp.
 
-`run(quick)` gives a list of rows, each ours against one peer on one workload; `scaling(quick)` the cost of a lookup
-against the size of the map. The process is pinned to one core while it measures, so that everybody has one thread.
+`run(quick)` gives a list of rows, each ours against one peer on one workload; `scaling(quick)` the
+cost of a lookup against the size of the map. The process is pinned to one core while it measures,
+so that everybody has one thread.
 
 Workloads, on the engine scene (thin blades):
-- *filter*: frames of 16 sensors x 64 zones that drift by 3 mm a frame with 5 mm of noise, looked up three times with
-  a slightly corrected pose, as the iterations of the filter do;
+- *filter*: frames of 16 sensors x 64 zones that drift by 3 mm a frame with 5 mm of noise, looked
+  up three times with a slightly corrected pose, as the iterations of the filter do;
 - *first visit*: the same frames for an index that has seen none of them;
 - *scattered*: single places all over the map, 1 to 10 cm from it, looked up often before.
 
-KISS-ICP does not offer its lookup alone: its row is one iteration of its registration, which adds the 6x6 sums of
-each pair. Its voxel map looks no further than the 27 voxels around, so that it is exact only near the surface.
+KISS-ICP does not offer its lookup alone: its row is one iteration of its registration, which adds
+the 6x6 sums of each pair. Its voxel map looks no further than the 27 voxels around, so that it is
+exact only near the surface.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
-
-import numpy as np
+import time
 
 from continuum_loc.evaluation.bench import one_core
 from continuum_loc.mapping.build import sample_mesh
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import PATIENCE
+import numpy as np
 
 MAX_DISTANCE = 0.1
 MAP_POINTS = 500_000
@@ -35,7 +37,10 @@ def run(quick: bool = False) -> list[dict]:
     prior = _engine_map(MAP_POINTS // (10 if quick else 1))
     repeats = 5 if quick else 15
     index = prior.index(reach=MAX_DISTANCE)
-    workloads = {"filter": _filter_frames(prior, 5 if quick else 20), "scattered": [_scattered(prior)]}
+    workloads = {
+        'filter': _filter_frames(prior, 5 if quick else 20),
+        'scattered': [_scattered(prior)],
+    }
     peers = dict(_peers(prior))
     rows = []
     with one_core():
@@ -43,11 +48,25 @@ def run(quick: bool = False) -> list[dict]:
             for _ in range(PATIENCE):
                 _ask(lambda q: index.nearest(q, MAX_DISTANCE), batches)
             for peer, query in peers.items():
-                rows.append(_compare(f"lookup, {name}", lambda q: index.nearest(q, MAX_DISTANCE), peer, query, batches,
-                                     repeats))
-        fastest = min((row for row in rows if row["name"] == "lookup, filter"), key=lambda row: row["peer_s"])["peer"]
-        rows.append(_compare_first_visit(index, fastest, peers[fastest], workloads["filter"], repeats))
-        rows.append(_compare_facing(prior, index, fastest, peers[fastest], workloads["filter"], repeats))
+                rows.append(
+                    _compare(
+                        f'lookup, {name}',
+                        lambda q: index.nearest(q, MAX_DISTANCE),
+                        peer,
+                        query,
+                        batches,
+                        repeats,
+                    )
+                )
+        fastest = min(
+            (row for row in rows if row['name'] == 'lookup, filter'), key=lambda row: row['peer_s']
+        )['peer']
+        rows.append(
+            _compare_first_visit(index, fastest, peers[fastest], workloads['filter'], repeats)
+        )
+        rows.append(
+            _compare_facing(prior, index, fastest, peers[fastest], workloads['filter'], repeats)
+        )
     return rows
 
 
@@ -64,16 +83,27 @@ def scaling(quick: bool = False) -> list[dict]:
             first = _ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames)
             for _ in range(PATIENCE):
                 _ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames)
-            again = min(_ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames) for _ in range(5))
+            again = min(
+                _ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames)
+                for _ in range(5)
+            )
         size = sum(array.nbytes for array in index.arrays if isinstance(array, np.ndarray))
-        rows.append({"points": count, "build_s": built, "first_visit_s": first, "lookup_s": again, "index_bytes": size})
+        rows.append(
+            {
+                'points': count,
+                'build_s': built,
+                'first_visit_s': first,
+                'lookup_s': again,
+                'index_bytes': size,
+            }
+        )
     return rows
 
 
 def _engine_mesh() -> tuple[np.ndarray, np.ndarray]:
     from continuum_loc.simulator.scenes import load_scene
 
-    scene = load_scene("S0")
+    scene = load_scene('S0')
     return scene.vertices, scene.faces
 
 
@@ -87,7 +117,9 @@ def _random_map(count: int) -> PriorMap:
 
     mesh = trimesh.Trimesh(*_engine_mesh(), process=False)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    return PriorMap(points, mesh.face_normals[faces], np.ones(count), spacing=float(np.sqrt(mesh.area / count)))
+    return PriorMap(
+        points, mesh.face_normals[faces], np.ones(count), spacing=float(np.sqrt(mesh.area / count))
+    )
 
 
 def _filter_frames(prior: PriorMap, frames: int, iterations: int = 3) -> list[np.ndarray]:
@@ -117,7 +149,9 @@ def _filter_zones(prior: PriorMap) -> tuple[np.ndarray, np.random.Generator]:
 def _scattered(prior: PriorMap, count: int = 20_000) -> np.ndarray:
     rng = np.random.default_rng(1)
     rows = rng.integers(0, len(prior), count)
-    return prior.points[rows] + rng.uniform(0.01, 0.1, (count, 1)) * _unit(rng.normal(size=(count, 3)))
+    return prior.points[rows] + rng.uniform(0.01, 0.1, (count, 1)) * _unit(
+        rng.normal(size=(count, 3))
+    )
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -129,7 +163,7 @@ def _peers(prior: PriorMap) -> Iterator[tuple[str, Query]]:
     from scipy.spatial import cKDTree
 
     tree = cKDTree(prior.points)
-    yield "SciPy cKDTree", lambda q: tree.query(q, distance_upper_bound=MAX_DISTANCE, workers=1)
+    yield 'SciPy cKDTree', lambda q: tree.query(q, distance_upper_bound=MAX_DISTANCE, workers=1)
     for optional in (_open3d_peers, _small_gicp_peer, _kiss_icp_peer):
         try:
             yield from optional(prior)
@@ -142,17 +176,17 @@ def _open3d_peers(prior: PriorMap) -> Iterator[tuple[str, Query]]:
 
     search = open3d.core.nns.NearestNeighborSearch(open3d.core.Tensor(prior.points))
     search.knn_index()
-    yield "Open3D NearestNeighborSearch", lambda q: search.knn_search(open3d.core.Tensor(q), 1)
+    yield 'Open3D NearestNeighborSearch', lambda q: search.knn_search(open3d.core.Tensor(q), 1)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(prior.points))
     tree = open3d.geometry.KDTreeFlann(cloud)
-    yield "Open3D KDTreeFlann", lambda q: [tree.search_knn_vector_3d(place, 1) for place in q]
+    yield 'Open3D KDTreeFlann', lambda q: [tree.search_knn_vector_3d(place, 1) for place in q]
 
 
 def _small_gicp_peer(prior: PriorMap) -> Iterator[tuple[str, Query]]:
     import small_gicp
 
     tree = small_gicp.KdTree(prior.points)
-    yield "small_gicp KdTree", lambda q: tree.batch_knn_search(q, 1, num_threads=1)
+    yield 'small_gicp KdTree', lambda q: tree.batch_knn_search(q, 1, num_threads=1)
 
 
 def _kiss_icp_peer(prior: PriorMap, voxel: float = 0.03) -> Iterator[tuple[str, Query]]:
@@ -166,7 +200,7 @@ def _kiss_icp_peer(prior: PriorMap, voxel: float = 0.03) -> Iterator[tuple[str, 
         points = kiss_icp_pybind._Vector3dVector(q)
         return registration._align_points_to_map(points, voxel_map, np.eye(4), MAX_DISTANCE, 0.01)
 
-    yield "KISS-ICP registration step", query
+    yield 'KISS-ICP registration step', query
 
 
 def _ask(query: Query, batches: list[np.ndarray]) -> float:
@@ -177,7 +211,9 @@ def _ask(query: Query, batches: list[np.ndarray]) -> float:
     return (time.process_time() - started) / sum(map(len, batches))
 
 
-def _compare(name: str, ours: Query, peer: str, query: Query, batches: list[np.ndarray], repeats: int) -> dict:
+def _compare(
+    name: str, ours: Query, peer: str, query: Query, batches: list[np.ndarray], repeats: int
+) -> dict:
     """Alternate ours and the peer's; the ratio's median and quartiles over the repeats."""
     query(batches[0])
     return _row(name, peer, [(_ask(ours, batches), _ask(query, batches)) for _ in range(repeats)])
@@ -187,9 +223,14 @@ def _row(name: str, peer: str, pairs: list[tuple[float, float]]) -> dict:
     times = np.array(pairs)
     ratio = times[:, 1] / times[:, 0]
     low, high = np.quantile(ratio, [0.25, 0.75])
-    return {"name": name, "ours_s": float(np.median(times[:, 0])), "peer": peer,
-            "peer_s": float(np.median(times[:, 1])), "ratio": float(np.median(ratio)),
-            "spread": [float(low), float(high)]}
+    return {
+        'name': name,
+        'ours_s': float(np.median(times[:, 0])),
+        'peer': peer,
+        'peer_s': float(np.median(times[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'spread': [float(low), float(high)],
+    }
 
 
 def _compare_first_visit(index, peer, query, batches, repeats) -> dict:
@@ -197,8 +238,13 @@ def _compare_first_visit(index, peer, query, batches, repeats) -> dict:
     pairs = []
     for _ in range(repeats):
         fresh = index.copy()
-        pairs.append((_ask(lambda q, fresh=fresh: fresh.nearest(q, MAX_DISTANCE), batches), _ask(query, batches)))
-    return _row("lookup, first visit", peer, pairs)
+        pairs.append(
+            (
+                _ask(lambda q, fresh=fresh: fresh.nearest(q, MAX_DISTANCE), batches),
+                _ask(query, batches),
+            )
+        )
+    return _row('lookup, first visit', peer, pairs)
 
 
 def _compare_facing(prior, index, peer, query, batches, repeats) -> dict:
@@ -208,13 +254,17 @@ def _compare_facing(prior, index, peer, query, batches, repeats) -> dict:
     beams = _unit(-prior.normals[rows] + 0.3 * rng.normal(size=(len(rows), 3)))
     ours: Query = lambda q: index.nearest_facing(q, beams, MAX_DISTANCE, 0.1)  # noqa: E731
     _ask(ours, batches)
-    return _compare("lookup, facing the beam", ours, peer, query, batches, repeats)
+    return _compare('lookup, facing the beam', ours, peer, query, batches, repeats)
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     for row in run():
-        print(f"{row['name']:24s} {row['ours_s'] * 1e9:7.0f} ns   {row['peer']:28s} {row['peer_s'] * 1e9:8.0f} ns   "
-              f"{row['ratio']:6.1f} x  ({row['spread'][0]:.1f} to {row['spread'][1]:.1f})")
+        print(
+            f'{row["name"]:24s} {row["ours_s"] * 1e9:7.0f} ns   {row["peer"]:28s} {row["peer_s"] * 1e9:8.0f} ns   '
+            f'{row["ratio"]:6.1f} x  ({row["spread"][0]:.1f} to {row["spread"][1]:.1f})'
+        )
     for row in scaling():
-        print(f"{row['points']:9d} points: built in {row['build_s']:.2f} s, {row['index_bytes'] / 1e6:.0f} MB, "
-              f"first visit {row['first_visit_s'] * 1e9:.0f} ns, again {row['lookup_s'] * 1e9:.0f} ns")
+        print(
+            f'{row["points"]:9d} points: built in {row["build_s"]:.2f} s, {row["index_bytes"] / 1e6:.0f} MB, '
+            f'first visit {row["first_visit_s"] * 1e9:.0f} ns, again {row["lookup_s"] * 1e9:.0f} ns'
+        )

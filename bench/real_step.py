@@ -1,19 +1,25 @@
-"""One step of the filter on a recorded trial: 5 nodes and 4 knots, covariance included, beside the published figure.
+"""
+One step of the filter on a recorded trial: 5 nodes and 4 knots, covariance included, beside the
+published figure.
 
-The trial is found through CONTINUUM_LOC_DATA; without it there are no rows. The published C++ code's 20 ms (19-21)
-are its authors' figure from another machine, so there is no ratio against it, only a bound in milliseconds.
+The trial is found through CONTINUUM_LOC_DATA; without it there are no rows. The published C++
+code's 20 ms (19-21) are its authors' figure from another machine, so there is no ratio against it,
+only a bound in milliseconds.
 """
 
 from __future__ import annotations
 
 import os
 
+from continuum_loc.estimator import load_estimator_settings, SlidingWindowFilter
+from continuum_loc.robot import load_robot
 import numpy as np
 
-from continuum_loc.estimator import SlidingWindowFilter, load_estimator_settings
-from continuum_loc.robot import load_robot
-
-BOUNDS = [("real trial, step", "ours_s", "at most", 5e-3)] if os.environ.get("CONTINUUM_LOC_DATA") else []
+BOUNDS = (
+    [('real trial, step', 'ours_s', 'at most', 5e-3)]
+    if os.environ.get('CONTINUUM_LOC_DATA')
+    else []
+)
 NODES, KNOTS = 5, 4
 
 
@@ -21,18 +27,28 @@ def run(quick: bool = False) -> list[dict]:
     """Rows of name, ours_s (the median over steps, in seconds) and p95_s; there is no peer to run."""
     if not BOUNDS:
         return []
-    from continuum_loc.evaluation.studies.real import ROBOT, data_folder, estimates
+    from continuum_loc.evaluation.studies.real import data_folder, estimates, ROBOT
     from msg_tools.tendon_robot import read_recording
 
     robot = load_robot(ROBOT)
-    recording = read_recording(data_folder() / "impulse_2", robot)
+    recording = read_recording(data_folder() / 'impulse_2', robot)
     settings = load_estimator_settings(ROBOT)
     estimator = SlidingWindowFilter(robot, None, settings)
     size = estimator.grid.nodes, 1 + round(settings.window / settings.knot_period)
     if size != (NODES, KNOTS):
-        raise ValueError(f"the window has {size[0]} nodes and {size[1]} knots; the figures are for {NODES} and {KNOTS}")
+        raise ValueError(
+            f'the window has {size[0]} nodes and {size[1]} knots; the figures are for {NODES} and {KNOTS}'
+        )
     estimates(recording, estimator, (7.0, 7.5))  # compiles, and fills the window
     *_, step_ms = estimates(recording, estimator, (7.5, 9.0 if quick else 18.0))
-    return [{"name": "real trial, step", "ours_s": 1e-3 * float(np.median(step_ms)),
-             "p95_s": 1e-3 * float(np.percentile(step_ms, 95)), "peer": None, "peer_s": None, "ratio": None,
-             "spread": None}]
+    return [
+        {
+            'name': 'real trial, step',
+            'ours_s': 1e-3 * float(np.median(step_ms)),
+            'p95_s': 1e-3 * float(np.percentile(step_ms, 95)),
+            'peer': None,
+            'peer_s': None,
+            'ratio': None,
+            'spread': None,
+        }
+    ]

@@ -1,14 +1,18 @@
-"""Shape from Hall sensors and IMUs: a whole estimate, and three positions beside SciPy's bounded minimisers.
+"""
+Shape from Hall sensors and IMUs: a whole estimate, and three positions beside SciPy's bounded
+minimisers.
 
 `run(quick)` gives a list of rows:
-- *shape, whole estimate*: what one estimate of the online estimator costs, the samples of three IMUs and three Hall
-  sensors since the last one included (attitude, three positions with covariances, the curve);
-- *shape, three positions*: eq. 10 for three modules, from the same start within the same bounds, with the same exact
-  gradients, to solutions that agree to a micrometre (`agreement_m`, the largest distance between them).
+- *shape, whole estimate*: what one estimate of the online estimator costs, the samples of three
+  IMUs and three Hall sensors since the last one included (attitude, three positions with
+  covariances, the curve);
+- *shape, three positions*: eq. 10 for three modules, from the same start within the same bounds,
+  with the same exact gradients, to solutions that agree to a micrometre (`agreement_m`, the
+  largest distance between them).
 
-SciPy's `trust-constr` is its interior-point minimiser, as MATLAB's `fmincon` is in the paper; `least_squares` is
-what one would rather use. Both solve for millimetres and relative fields, in which they
-behave best, and `trust-constr` to its own default tolerances.
+SciPy's `trust-constr` is its interior-point minimiser, as MATLAB's `fmincon` is in the paper;
+`least_squares` is what one would rather use. Both solve for millimetres and relative fields, in
+which they behave best, and `trust-constr` to its own default tolerances.
 """
 
 from __future__ import annotations
@@ -16,33 +20,43 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from time import perf_counter
 
-import numpy as np
-from scipy.optimize import Bounds, least_squares, minimize
-
 from continuum_loc.evaluation.bench import one_core
-from continuum_loc.robot import RobotDescription, load_robot
+from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.shape import ShapeEstimator, ShapeSettings
 from continuum_loc.shape.magnet import field_and_gradient
 from continuum_loc.shape.position import PositionSolver
 from continuum_loc.shape.simulate import Arm, bent, groove_motion, out_of_plane
+import numpy as np
+from scipy.optimize import Bounds, least_squares, minimize
 
-BOUNDS = [("shape, whole estimate", "ours_s", "at most", 0.5e-3),
-          ("shape, three positions", "ours_s", "at most", 0.3e-3),
-          ("three positions, trust-constr", "ratio", "at least", 50.0),
-          ("shape, three positions", "agreement_m", "at most", 1e-6)]
+BOUNDS = [
+    ('shape, whole estimate', 'ours_s', 'at most', 0.5e-3),
+    ('shape, three positions', 'ours_s', 'at most', 0.3e-3),
+    ('three positions, trust-constr', 'ratio', 'at least', 50.0),
+    ('shape, three positions', 'agreement_m', 'at most', 1e-6),
+]
 MM = 1e-3
 Solve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def run(quick: bool = False) -> list[dict]:
     """Rows of name, ours_s, peer, peer_s (seconds), ratio (peer / ours), spread (its quartiles) and agreement_m."""
-    robot = load_robot("hall_arm")
-    solver = PositionSolver(robot.magnet, np.array([robot.sensor_arclength(sensor.name) for sensor in robot.hall]))
+    robot = load_robot('hall_arm')
+    solver = PositionSolver(
+        robot.magnet, np.array([robot.sensor_arclength(sensor.name) for sensor in robot.hall])
+    )
     problems = list(_problems(robot, 4 if quick else 12))
     with one_core():
         rows = [_whole_estimate(robot, 2 if quick else 6)]
-        rows += [_compare(solver, f"shape, three positions, {name}", name, peer, problems, 3 if quick else 9)
-                 for name, peer in (("trust-constr", _trust_constr(solver)), ("least_squares", _least_squares(solver)))]
+        rows += [
+            _compare(
+                solver, f'shape, three positions, {name}', name, peer, problems, 3 if quick else 9
+            )
+            for name, peer in (
+                ('trust-constr', _trust_constr(solver)),
+                ('least_squares', _least_squares(solver)),
+            )
+        ]
     return rows
 
 
@@ -52,7 +66,11 @@ def _whole_estimate(robot: RobotDescription, repeats: int) -> dict:
     samples = arm.record(groove_motion(arm, bent(robot, 12.5)))
     times = []
     for _ in range(repeats + 1):
-        estimator, spent, costs = ShapeEstimator(robot, ShapeSettings(rate=robot.imu_model.rate)), 0.0, []
+        estimator, spent, costs = (
+            ShapeEstimator(robot, ShapeSettings(rate=robot.imu_model.rate)),
+            0.0,
+            [],
+        )
         for sample in samples:
             begin = perf_counter()
             estimate = estimator.process(sample)
@@ -61,8 +79,14 @@ def _whole_estimate(robot: RobotDescription, repeats: int) -> dict:
                 costs.append(spent)
                 spent = 0.0
         times.append(float(np.median(costs)))
-    return {"name": "shape, whole estimate", "ours_s": float(np.median(times[1:])), "peer": None, "peer_s": None,
-            "ratio": None, "spread": None}
+    return {
+        'name': 'shape, whole estimate',
+        'ours_s': float(np.median(times[1:])),
+        'peer': None,
+        'peer_s': None,
+        'ratio': None,
+        'spread': None,
+    }
 
 
 def _problems(robot: RobotDescription, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -74,7 +98,10 @@ def _problems(robot: RobotDescription, count: int) -> Iterator[tuple[np.ndarray,
         strain = bent(robot, curvature, turn) if k % 2 else out_of_plane(robot, curvature, turn)
         p = arm.T_base_module(strain)[:, :3, 3]
         noise = robot.hall_model.sigma * rng.standard_normal((3, 3))
-        yield field_and_gradient(robot.magnet, p)[0] + noise, p + 2e-3 * rng.standard_normal((3, 3))
+        yield (
+            field_and_gradient(robot.magnet, p)[0] + noise,
+            p + 2e-3 * rng.standard_normal((3, 3)),
+        )
 
 
 def _trust_constr(solver: PositionSolver) -> Solve:
@@ -89,8 +116,16 @@ def _trust_constr(solver: PositionSolver) -> Solve:
                 return error @ error, 2.0 * MM / size * (gradient.T @ error)
 
             low, high = solver.lower[m], solver.upper[m]
-            found[m] = minimize(cost, np.clip(start[m], low, high) / MM, jac=True, method="trust-constr",
-                                bounds=Bounds(low / MM, high / MM)).x * MM
+            found[m] = (
+                minimize(
+                    cost,
+                    np.clip(start[m], low, high) / MM,
+                    jac=True,
+                    method='trust-constr',
+                    bounds=Bounds(low / MM, high / MM),
+                ).x
+                * MM
+            )
         return found
 
     return solve
@@ -102,19 +137,40 @@ def _least_squares(solver: PositionSolver) -> Solve:
         for m in range(3):
             size, low, high = np.linalg.norm(field[m]), solver.lower[m], solver.upper[m]
             inside = np.clip(start[m], low + 1e-6, high - 1e-6)
-            found[m] = least_squares(
-                lambda q, m=m, size=size: (field_and_gradient(solver.magnet, q * MM)[0] - field[m]) / size, inside / MM,
-                jac=lambda q, size=size: field_and_gradient(solver.magnet, q * MM)[1] * MM / size,
-                bounds=(low / MM, high / MM), xtol=1e-10, ftol=1e-12, gtol=1e-12).x * MM
+            found[m] = (
+                least_squares(
+                    lambda q, m=m, size=size: (
+                        (field_and_gradient(solver.magnet, q * MM)[0] - field[m]) / size
+                    ),
+                    inside / MM,
+                    jac=lambda q, size=size: (
+                        field_and_gradient(solver.magnet, q * MM)[1] * MM / size
+                    ),
+                    bounds=(low / MM, high / MM),
+                    xtol=1e-10,
+                    ftol=1e-12,
+                    gtol=1e-12,
+                ).x
+                * MM
+            )
         return found
 
     return solve
 
 
-def _compare(solver: PositionSolver, name: str, peer: str, theirs: Solve,
-             problems: list[tuple[np.ndarray, np.ndarray]], repeats: int) -> dict:
+def _compare(
+    solver: PositionSolver,
+    name: str,
+    peer: str,
+    theirs: Solve,
+    problems: list[tuple[np.ndarray, np.ndarray]],
+    repeats: int,
+) -> dict:
     """Alternate ours and the peer's over all problems; ours repeats them, being quicker than the clock's noise."""
-    gaps = [np.linalg.norm(solver.solve(*problem).position - theirs(*problem), axis=1).max() for problem in problems]
+    gaps = [
+        np.linalg.norm(solver.solve(*problem).position - theirs(*problem), axis=1).max()
+        for problem in problems
+    ]
     times = np.empty((repeats, 2))
     for row in times:
         begin = perf_counter()
@@ -127,11 +183,17 @@ def _compare(solver: PositionSolver, name: str, peer: str, theirs: Solve,
         row[:] = (middle - begin) / (20 * len(problems)), (perf_counter() - middle) / len(problems)
     ratio = times[:, 1] / times[:, 0]
     low, high = np.quantile(ratio, [0.25, 0.75])
-    return {"name": name, "ours_s": float(np.median(times[:, 0])), "peer": f"SciPy {peer}",
-            "peer_s": float(np.median(times[:, 1])), "ratio": float(np.median(ratio)),
-            "spread": [float(low), float(high)], "agreement_m": float(max(gaps))}
+    return {
+        'name': name,
+        'ours_s': float(np.median(times[:, 0])),
+        'peer': f'SciPy {peer}',
+        'peer_s': float(np.median(times[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'spread': [float(low), float(high)],
+        'agreement_m': float(max(gaps)),
+    }
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     for row in run():
         print(row)

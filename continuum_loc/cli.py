@@ -1,38 +1,58 @@
-"""The command line `continuum-loc`. Each command reads its arguments and calls the library; work is done there.
+"""
+The command line `continuum-loc`. Each command reads its arguments and calls the library; work is
+done there.
 
 Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+import sys
+from typing import Annotated, Any, TYPE_CHECKING
 
-import typer
 from rich.console import Console
 from rich.markup import escape
+import typer
 
 # Commands import what they need themselves, so that `--help` takes a tenth of a second.
 if TYPE_CHECKING:
     from continuum_loc.evaluation.study import Claim
 
 OK, FAILED, USAGE = 0, 1, 2
-OUR_PACKAGES = ("continuum_loc", "msg_tools")
+OUR_PACKAGES = ('continuum_loc', 'msg_tools')
 
-app = typer.Typer(name="continuum-loc", no_args_is_help=True, add_completion=False, rich_markup_mode="markdown",
-                  pretty_exceptions_enable=False, help="Online localisation and shape of continuum robots.")
-map_app = typer.Typer(no_args_is_help=True, help="Build, convert and inspect prior maps.", rich_markup_mode="markdown")
-app.add_typer(map_app, name="map")
+app = typer.Typer(
+    name='continuum-loc',
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode='markdown',
+    pretty_exceptions_enable=False,
+    help='Online localisation and shape of continuum robots.',
+)
+map_app = typer.Typer(
+    no_args_is_help=True,
+    help='Build, convert and inspect prior maps.',
+    rich_markup_mode='markdown',
+)
+app.add_typer(map_app, name='map')
 console = Console()
 errors = Console(stderr=True)
 
-Robot = Annotated[str, typer.Option(help="`engine`, `soft_arm`, `hall_arm`, or your own description (YAML)")]
-Scene = Annotated[str, typer.Option(help="`S0`-`S9`, `R0`-`R4`, or your own mesh (STL, OBJ, PLY; metres)")]
-MapFile = Annotated[Path | None, typer.Option("--map", help="prior map: .npz .ply .pcd .xyz .csv, or a mesh")]
-Seed = Annotated[int, typer.Option(help="seed of everything random")]
-Runs = Annotated[Path, typer.Option("--out", help="folder of the numbered runs")]
-Settings = Annotated[Path | None, typer.Option(help="estimator settings (YAML); default: those of the robot")]
+Robot = Annotated[
+    str, typer.Option(help='`engine`, `soft_arm`, `hall_arm`, or your own description (YAML)')
+]
+Scene = Annotated[
+    str, typer.Option(help='`S0`-`S9`, `R0`-`R4`, or your own mesh (STL, OBJ, PLY; metres)')
+]
+MapFile = Annotated[
+    Path | None, typer.Option('--map', help='prior map: .npz .ply .pcd .xyz .csv, or a mesh')
+]
+Seed = Annotated[int, typer.Option(help='seed of everything random')]
+Runs = Annotated[Path, typer.Option('--out', help='folder of the numbered runs')]
+Settings = Annotated[
+    Path | None, typer.Option(help='estimator settings (YAML); default: those of the robot')
+]
 
 
 def main() -> None:
@@ -40,18 +60,24 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        if type(error).__module__.split(".")[0] not in OUR_PACKAGES:
+        if type(error).__module__.split('.')[0] not in OUR_PACKAGES:
             raise
-        errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        errors.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False, soft_wrap=True)
         sys.exit(USAGE if isinstance(error, ValueError) else FAILED)
 
 
 @app.command()
-def demo(robot: Robot = "engine", scene: Scene = "S0",
-         trajectory: Annotated[str, typer.Option(help="named motion of the robot")] = "t1",
-         duration: Annotated[float, typer.Option(help="seconds of live running", min=2.0)] = 20.0,
-         seed: Seed = 0, out: Runs = Path("runs")) -> None:
-    """The whole path: simulator and estimator live over ROS 2, a bag, a report, and the same again from the bag.
+def demo(
+    robot: Robot = 'engine',
+    scene: Scene = 'S0',
+    trajectory: Annotated[str, typer.Option(help='named motion of the robot')] = 't1',
+    duration: Annotated[float, typer.Option(help='seconds of live running', min=2.0)] = 20.0,
+    seed: Seed = 0,
+    out: Runs = Path('runs'),
+) -> None:
+    """
+    The whole path: simulator and estimator live over ROS 2, a bag, a report, and the same again
+    from the bag.
 
     Example: `continuum-loc demo --trajectory t2 --duration 10`
     """
@@ -59,46 +85,68 @@ def demo(robot: Robot = "engine", scene: Scene = "S0",
     from continuum_loc.evaluation.trials import Trial
 
     with _busy() as status:
-        outcome = run_demo(Trial(robot, scene, trajectory, seed=seed, duration=duration), out, status.update)
+        outcome = run_demo(
+            Trial(robot, scene, trajectory, seed=seed, duration=duration), out, status.update
+        )
     console.print(_run_table(outcome.summary))
-    console.print(f"report  [link=file://{outcome.folder}/report.html]{outcome.folder}/report.html[/link]")
-    console.print(f"bag     {outcome.bag}")
+    console.print(
+        f'report  [link=file://{outcome.folder}/report.html]{outcome.folder}/report.html[/link]'
+    )
+    console.print(f'bag     {outcome.bag}')
     for claim in outcome.claims:
         if not claim.holds:  # a slow machine is no failure of the demo; two different replays are
-            errors.print(f"[yellow]missed:[/] {claim.name} {claim.value:.3g} {claim.unit} (bound {claim.bound})",
-                         highlight=False)
+            errors.print(
+                f'[yellow]missed:[/] {claim.name} {claim.value:.3g} {claim.unit} (bound {claim.bound})',
+                highlight=False,
+            )
     if not outcome.identical:
         raise typer.Exit(FAILED)
-    console.print("replay  two replays of the bag without ROS gave the same estimate, to the last bit")
+    console.print(
+        'replay  two replays of the bag without ROS gave the same estimate, to the last bit'
+    )
 
 
 @app.command()
-def simulate(bag: Annotated[Path, typer.Argument(help="new bag folder to write")], robot: Robot = "engine",
-             scene: Scene = "S0", trajectory: Annotated[str, typer.Option(help="named motion of the robot")] = "t1",
-             profile: Annotated[str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")] = "full",
-             fidelity: Annotated[str, typer.Option(help="ToF model: `paper` or `vl53l5cx`")] = "paper",
-             duration: Annotated[float | None, typer.Option(help="seconds; default: the whole trajectory")] = None,
-             seed: Seed = 0) -> None:
-    """Record a simulated trial, sensors and truth, into a bag (rosbag2, MCAP) as fast as it goes.
+def simulate(
+    bag: Annotated[Path, typer.Argument(help='new bag folder to write')],
+    robot: Robot = 'engine',
+    scene: Scene = 'S0',
+    trajectory: Annotated[str, typer.Option(help='named motion of the robot')] = 't1',
+    profile: Annotated[
+        str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")
+    ] = 'full',
+    fidelity: Annotated[str, typer.Option(help='ToF model: `paper` or `vl53l5cx`')] = 'paper',
+    duration: Annotated[
+        float | None, typer.Option(help='seconds; default: the whole trajectory')
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """
+    Record a simulated trial, sensors and truth, into a bag (rosbag2, MCAP) as fast as it goes.
 
     Example: `continuum-loc simulate /tmp/trial --scene S3 --trajectory t2 --seed 4`
     """
     from continuum_loc.evaluation.trials import Trial, world, write_bag
 
-    trial = Trial(robot, scene, trajectory, profile=profile, fidelity=fidelity, seed=seed, duration=duration)
+    trial = Trial(
+        robot, scene, trajectory, profile=profile, fidelity=fidelity, seed=seed, duration=duration
+    )
     with _busy() as status:
-        status.update("building the scene and letting the robot come to rest")
+        status.update('building the scene and letting the robot come to rest')
         made = world(trial)
     seconds = made.trajectory.duration if duration is None else duration
-    counts = write_bag(bag, _progress(made.run(duration), "simulating", seconds))
-    _count_table(counts, f"{bag}: {seconds:g} s")
+    counts = write_bag(bag, _progress(made.run(duration), 'simulating', seconds))
+    _count_table(counts, f'{bag}: {seconds:g} s')
 
 
-@app.command("import-trial")
-def import_trial_command(folder: Annotated[Path, typer.Argument(help="folder of one recorded trial's CSV files")],
-                         bag: Annotated[Path, typer.Argument(help="new bag folder to write")],
-                         robot: Annotated[str, typer.Option(help="which sensor sits where")] = "tendon_robot") -> None:
-    """Write a recorded trial of the tendon-driven robot, measurements and truth, into a bag.
+@app.command('import-trial')
+def import_trial_command(
+    folder: Annotated[Path, typer.Argument(help="folder of one recorded trial's CSV files")],
+    bag: Annotated[Path, typer.Argument(help='new bag folder to write')],
+    robot: Annotated[str, typer.Option(help='which sensor sits where')] = 'tendon_robot',
+) -> None:
+    """
+    Write a recorded trial of the tendon-driven robot, measurements and truth, into a bag.
 
     Example: `continuum-loc import-trial slow_free_space /tmp/slow`
     """
@@ -109,11 +157,23 @@ def import_trial_command(folder: Annotated[Path, typer.Argument(help="folder of 
 
 
 @app.command()
-def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db3 file")], robot: Robot = "engine",
-           map_file: MapFile = None, scene: Annotated[str, typer.Option(help="scene shown in the report, and whose "
-           "map is taken where `--map` is not given")] = "S0", settings: Settings = None, seed: Seed = 0,
-           out: Runs = Path("runs")) -> None:
-    """Localise from a recorded bag without a ROS graph; the same bag gives the same estimate, bit for bit.
+def replay(
+    bag: Annotated[Path, typer.Argument(help='bag folder, or .mcap or .db3 file')],
+    robot: Robot = 'engine',
+    map_file: MapFile = None,
+    scene: Annotated[
+        str,
+        typer.Option(
+            help='scene shown in the report, and whose map is taken where `--map` is not given'
+        ),
+    ] = 'S0',
+    settings: Settings = None,
+    seed: Seed = 0,
+    out: Runs = Path('runs'),
+) -> None:
+    """
+    Localise from a recorded bag without a ROS graph; the same bag gives the same estimate, bit for
+    bit.
 
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
@@ -127,23 +187,43 @@ def replay(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db
 
     description = load_robot(robot)
     with _busy() as status:
-        status.update("loading the prior map")
+        status.update('loading the prior map')
         map_file = map_file or scene_map_file(scene)
-        estimator = make_filter(description, load_map(map_file), settings_of(description.name, settings))
-    result = run_replay(_progress(samples_of(bag), "replaying", _bag_duration(bag)), estimator)
-    folder = new_run("replay", out)
-    summary = save_run(folder, result, kind="replay", seed=seed, configuration={
-        "robot": description, "bag": bag, "map": {"file": map_file}, "scene": scene, "estimator": estimator.settings})
+        estimator = make_filter(
+            description, load_map(map_file), settings_of(description.name, settings)
+        )
+    result = run_replay(_progress(samples_of(bag), 'replaying', _bag_duration(bag)), estimator)
+    folder = new_run('replay', out)
+    summary = save_run(
+        folder,
+        result,
+        kind='replay',
+        seed=seed,
+        configuration={
+            'robot': description,
+            'bag': bag,
+            'map': {'file': map_file},
+            'scene': scene,
+            'estimator': estimator.settings,
+        },
+    )
     _write_report(folder)
     console.print(_run_table(summary))
-    console.print(f"report  {folder}/report.html")
+    console.print(f'report  {folder}/report.html')
 
 
 @app.command()
-def shape(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db3 file")], robot: Robot = "hall_arm",
-          settings: Annotated[Path | None, typer.Option(help="shape settings (YAML); default: the package's")] = None,
-          out: Runs = Path("runs")) -> None:
-    """Estimate the shape from Hall sensors and IMUs of a recorded bag; the robot rests while it begins.
+def shape(
+    bag: Annotated[Path, typer.Argument(help='bag folder, or .mcap or .db3 file')],
+    robot: Robot = 'hall_arm',
+    settings: Annotated[
+        Path | None, typer.Option(help="shape settings (YAML); default: the package's")
+    ] = None,
+    out: Runs = Path('runs'),
+) -> None:
+    """
+    Estimate the shape from Hall sensors and IMUs of a recorded bag; the robot rests while it
+    begins.
 
     Example: `continuum-loc shape bench_top.mcap --robot my_arm.yaml`
     """
@@ -156,28 +236,39 @@ def shape(bag: Annotated[Path, typer.Argument(help="bag folder, or .mcap or .db3
 
     description = load_robot(robot)
     estimator = ShapeReplay(description, load_shape_settings(settings))
-    result = run_replay(_progress(samples_of(bag), "estimating", _bag_duration(bag)), estimator)
-    folder = new_run("shape", out)
-    summary = save_run(folder, result, kind="shape", seed=None, configuration={
-        "robot": description, "bag": bag, "estimator": estimator.settings})
+    result = run_replay(_progress(samples_of(bag), 'estimating', _bag_duration(bag)), estimator)
+    folder = new_run('shape', out)
+    summary = save_run(
+        folder,
+        result,
+        kind='shape',
+        seed=None,
+        configuration={'robot': description, 'bag': bag, 'estimator': estimator.settings},
+    )
     _write_report(folder)
     console.print(_run_table(summary))
-    console.print(f"report  {folder}/report.html")
+    console.print(f'report  {folder}/report.html')
 
 
 @app.command()
-def tune(out: Annotated[Path, typer.Argument(help="settings file to write (YAML)")], robot: Robot = "engine",
-         bag: Annotated[Path | None, typer.Option(help="recorded hold-out with truth; default: the robot's own, "
-                                                  "simulated")] = None,
-         map_file: MapFile = None, settings: Settings = None,
-         jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1) -> None:
-    """Sweep process and measurement noise on a hold-out bag, by error and by consistency, and write what is best.
+def tune(
+    out: Annotated[Path, typer.Argument(help='settings file to write (YAML)')],
+    robot: Robot = 'engine',
+    bag: Annotated[
+        Path | None,
+        typer.Option(help="recorded hold-out with truth; default: the robot's own, simulated"),
+    ] = None,
+    map_file: MapFile = None,
+    settings: Settings = None,
+    jobs: Annotated[int, typer.Option(help='processes', min=1)] = 1,
+) -> None:
+    """
+    Sweep process and measurement noise on a hold-out bag, by error and by consistency, and write
+    what is best.
 
     Example: `continuum-loc tune my_settings.yaml --bag hold_out --map my_map.npz --jobs 2`
     """
     import tempfile
-
-    from rich.progress import Progress
 
     from continuum_loc.estimator.settings import settings_of
     from continuum_loc.evaluation.split import hold_out
@@ -186,99 +277,153 @@ def tune(out: Annotated[Path, typer.Argument(help="settings file to write (YAML)
     from continuum_loc.evaluation.tune import tune as sweep
     from continuum_loc.robot import load_robot
     from continuum_loc.settings import dump_settings
+    from rich.progress import Progress
 
     description = load_robot(robot)
     start = settings_of(description.name, settings)
-    with tempfile.TemporaryDirectory() as scratch, Progress(console=errors, transient=True) as progress:
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        Progress(console=errors, transient=True) as progress,
+    ):
         if bag is None:
-            bag = Path(scratch) / "hold_out"
-            progress.console.print(f"simulating the hold-out {hold_out(robot).recording}")
+            bag = Path(scratch) / 'hold_out'
+            progress.console.print(f'simulating the hold-out {hold_out(robot).recording}')
             write_bag(bag, simulate(hold_out(robot)))
-        task = progress.add_task("sweeping", total=1 + len(PARAMETERS) * len(FACTORS))
-        best, tried = sweep(bag, description, map_file or scene_map_file(hold_out(robot).scene), start, jobs,
-                            tell=lambda one: progress.advance(task))
+        task = progress.add_task('sweeping', total=1 + len(PARAMETERS) * len(FACTORS))
+        best, tried = sweep(
+            bag,
+            description,
+            map_file or scene_map_file(hold_out(robot).scene),
+            start,
+            jobs,
+            tell=lambda one: progress.advance(task),
+        )
     dump_settings(best, out)
     best_tried = min(tried, key=lambda one: one.cost)
-    for name, one in (("start", tried[0]), ("best", best_tried)):
-        console.print(f"{name:6}{100 * one.translation_rmse_m:.3f} cm  {one.rotation_rmse_deg:.3f} deg  NEES/dof "
-                      f"{one.nees_per_dof:.2f}", highlight=False)
-    console.print(f"written {out}")
+    for name, one in (('start', tried[0]), ('best', best_tried)):
+        console.print(
+            f'{name:6}{100 * one.translation_rmse_m:.3f} cm  {one.rotation_rmse_deg:.3f} deg  NEES/dof '
+            f'{one.nees_per_dof:.2f}',
+            highlight=False,
+        )
+    console.print(f'written {out}')
 
 
 @app.command()
-def report(run: Annotated[Path, typer.Argument(help="run folder")] = Path("runs/latest"),
-           picture: Annotated[Path | None, typer.Option(help="also draw a still (PNG) and a moving picture (GIF): "
-                                                        "their path without the ending")] = None) -> None:
-    """Make the report of a run anew, from the files in its folder.
+def report(
+    run: Annotated[Path, typer.Argument(help='run folder')] = Path('runs/latest'),
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help='also draw a still (PNG) and a moving picture (GIF): '
+            'their path without the ending'
+        ),
+    ] = None,
+) -> None:
+    """
+    Make the report of a run anew, from the files in its folder.
 
     Example: `continuum-loc report runs/0003-replay --picture docs/localising`
     """
     path = _write_report(run)
-    console.print(f"report  {path}")
+    console.print(f'report  {path}')
     if picture is not None:
         from continuum_loc.evaluation.pictures import draw
 
         with _busy() as status:
-            status.update("drawing")
+            status.update('drawing')
             for made in draw(run, picture):
-                console.print(f"picture {made}")
+                console.print(f'picture {made}')
 
 
 @app.command()
-def evaluate(name: Annotated[str | None, typer.Argument(help="study; without one they are listed; `bags` for "
-                                                        "recordings of your own")] = None,
-             folder: Annotated[Path | None, typer.Argument(help="with `bags`: the folder that holds them")] = None,
-             quick: Annotated[bool, typer.Option("--quick", help="a small honest subset, under a minute")] = False,
-             out: Annotated[Path | None, typer.Option(help="folder of the results; default: a new run")] = None,
-             seed: Seed = 0, jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
-             scheduler: Annotated[str, typer.Option(help="address of a Dask scheduler to run the trials on")] = "",
-             robot: Annotated[str, typer.Option(help="with `bags`: the robot")] = "engine",
-             map_file: Annotated[Path | None, typer.Option("--map", help="with `bags`: the prior map")] = None,
-             settings: Settings = None) -> None:
-    """Run a study and compare its figures with their bounds; the exit code is 1 where one does not hold.
+def evaluate(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help='study; without one they are listed; `bags` for recordings of your own'
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Argument(help='with `bags`: the folder that holds them')
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option('--quick', help='a small honest subset, under a minute')
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help='folder of the results; default: a new run')
+    ] = None,
+    seed: Seed = 0,
+    jobs: Annotated[int, typer.Option(help='processes', min=1)] = 1,
+    scheduler: Annotated[
+        str, typer.Option(help='address of a Dask scheduler to run the trials on')
+    ] = '',
+    robot: Annotated[str, typer.Option(help='with `bags`: the robot')] = 'engine',
+    map_file: Annotated[
+        Path | None, typer.Option('--map', help='with `bags`: the prior map')
+    ] = None,
+    settings: Settings = None,
+) -> None:
+    """
+    Run a study and compare its figures with their bounds; the exit code is 1 where one does not
+    hold.
 
     An interrupted study continues where it stopped when its `--out` is given again.
 
-    Example: `continuum-loc evaluate table2 --quick --jobs 2`, `continuum-loc evaluate bags my_bags --map my_map.npz`
+    Example: `continuum-loc evaluate table2 --quick --jobs 2`, `continuum-loc evaluate bags my_bags
+    --map my_map.npz`
     """
     from continuum_loc.evaluation.campaign import SCHEDULER
     from continuum_loc.evaluation.runs import new_run
     from continuum_loc.evaluation.study import load_study, study_names
 
     if name is None:
-        console.print("studies: " + ", ".join([*study_names(), "bags DIR"]))
+        console.print('studies: ' + ', '.join([*study_names(), 'bags DIR']))
         return
-    if name == "bags" and (folder is None or map_file is None):
-        raise typer.BadParameter("bags needs a folder and a map: evaluate bags DIR --map FILE")
-    run = None if name == "bags" else load_study(name)
+    if name == 'bags' and (folder is None or map_file is None):
+        raise typer.BadParameter('bags needs a folder and a map: evaluate bags DIR --map FILE')
+    run = None if name == 'bags' else load_study(name)
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
     SCHEDULER.set(scheduler)
-    claims = run(out, quick, seed, jobs) if run else _evaluate_bags(folder, robot, map_file, settings, out, jobs)
+    claims = (
+        run(out, quick, seed, jobs)
+        if run
+        else _evaluate_bags(folder, robot, map_file, settings, out, jobs)
+    )
     console.print(_claims_table(claims))
-    console.print(f"results {out}")
+    console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
 
 
-def _evaluate_bags(folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path,
-                   jobs: int) -> list[Claim]:
+def _evaluate_bags(
+    folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path, jobs: int
+) -> list[Claim]:
     from continuum_loc.estimator.settings import settings_of
     from continuum_loc.evaluation.bags import evaluate_bags
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
-    return evaluate_bags(folder, description, map_file, settings_of(description.name, settings), out,
-                         jobs)
+    return evaluate_bags(
+        folder, description, map_file, settings_of(description.name, settings), out, jobs
+    )
 
 
 @app.command()
-def bench(quick: Annotated[bool, typer.Option("--quick", help="few repeats, small sizes")] = False,
-          out: Annotated[Path | None, typer.Option(help="folder of the results; default: a new run")] = None,
-          only: Annotated[str | None, typer.Option(help="one benchmark by name")] = None,
-          check: Annotated[bool, typer.Option("--check", help="compare with the committed baseline")] = False,
-          baseline: Annotated[bool, typer.Option("--baseline", help="commit to these ratios")] = False,
-          peers: Annotated[bool, typer.Option(help="install what we are compared with")] = True) -> None:
-    """Measure everything a user waits for beside what they would use instead, as ratios with spread.
+def bench(
+    quick: Annotated[bool, typer.Option('--quick', help='few repeats, small sizes')] = False,
+    out: Annotated[
+        Path | None, typer.Option(help='folder of the results; default: a new run')
+    ] = None,
+    only: Annotated[str | None, typer.Option(help='one benchmark by name')] = None,
+    check: Annotated[
+        bool, typer.Option('--check', help='compare with the committed baseline')
+    ] = False,
+    baseline: Annotated[bool, typer.Option('--baseline', help='commit to these ratios')] = False,
+    peers: Annotated[bool, typer.Option(help='install what we are compared with')] = True,
+) -> None:
+    """
+    Measure everything a user waits for beside what they would use instead, as ratios with spread.
 
     Example: `continuum-loc bench --quick --only lookup`
     """
@@ -288,28 +433,35 @@ def bench(quick: Annotated[bool, typer.Option("--quick", help="few repeats, smal
     names = benches.bench_names()
     if peers:
         benches.install_peers()
-    outcome = benches.run_bench(out or new_run("bench"), quick, only, _each)
+    outcome = benches.run_bench(out or new_run('bench'), quick, only, _each)
     console.print(_text_table(benches.table(outcome.rows)))
     if outcome.claims:
         console.print(_claims_table(outcome.claims))
     for line in outcome.failures:
-        errors.print(f"[bold red]failed:[/] {escape(line)}", highlight=False)
+        errors.print(f'[bold red]failed:[/] {escape(line)}', highlight=False)
     if baseline:
         benches.write_baseline(outcome.rows)
     regressions = outcome.regressions() if check else []
     for line in regressions:
-        errors.print(f"[bold red]slower than the baseline:[/] {escape(line)}", highlight=False)
-    held = all(claim.holds for claim in outcome.claims) or quick  # sizes and repeats of --quick prove no bound
+        errors.print(f'[bold red]slower than the baseline:[/] {escape(line)}', highlight=False)
+    held = (
+        all(claim.holds for claim in outcome.claims) or quick
+    )  # sizes and repeats of --quick prove no bound
     raise typer.Exit(OK if names and held and not (outcome.failures or regressions) else FAILED)
 
 
-@map_app.command("build")
-def map_build(scene: Annotated[str, typer.Argument(help="scene name or mesh file")],
-              out: Annotated[Path, typer.Argument(help="file to write: .npz .ply .csv .xyz")],
-              points: Annotated[int, typer.Option(help="about how many points", min=100)] = 300_000,
-              spacing: Annotated[float | None, typer.Option(help="distance of the points [m]; instead of --points")]
-              = None, seed: Seed = 0) -> None:
-    """Sample a prior map from a scene or from your own mesh.
+@map_app.command('build')
+def map_build(
+    scene: Annotated[str, typer.Argument(help='scene name or mesh file')],
+    out: Annotated[Path, typer.Argument(help='file to write: .npz .ply .csv .xyz')],
+    points: Annotated[int, typer.Option(help='about how many points', min=100)] = 300_000,
+    spacing: Annotated[
+        float | None, typer.Option(help='distance of the points [m]; instead of --points')
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """
+    Sample a prior map from a scene or from your own mesh.
 
     Example: `continuum-loc map build my_engine.stl my_map.npz --spacing 0.005`
     """
@@ -317,20 +469,25 @@ def map_build(scene: Annotated[str, typer.Argument(help="scene name or mesh file
     from continuum_loc.simulator.scenes import load_scene
 
     with _busy() as status:
-        status.update("sampling the surface")
+        status.update('sampling the surface')
         mesh = load_scene(scene)
-        density = {"count": points} if spacing is None else {"spacing": spacing}
+        density = {'count': points} if spacing is None else {'spacing': spacing}
         prior = sample_mesh(mesh.vertices, mesh.faces, **density, seed=seed, source=scene)
         prior.save(out)
     _describe_map(out, prior)
 
 
-@map_app.command("convert")
-def map_convert(source: Annotated[Path, typer.Argument(help="cloud or mesh to read")],
-                out: Annotated[Path, typer.Argument(help="file to write: .npz .ply .csv .xyz")],
-                viewpoint: Annotated[tuple[float, float, float] | None, typer.Option(help="a place that the surface "
-                                     "is seen from, for clouds without normals")] = None) -> None:
-    """Read a map in any known form and write it in another.
+@map_app.command('convert')
+def map_convert(
+    source: Annotated[Path, typer.Argument(help='cloud or mesh to read')],
+    out: Annotated[Path, typer.Argument(help='file to write: .npz .ply .csv .xyz')],
+    viewpoint: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help='a place that the surface is seen from, for clouds without normals'),
+    ] = None,
+) -> None:
+    """
+    Read a map in any known form and write it in another.
 
     Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1`
     """
@@ -341,9 +498,10 @@ def map_convert(source: Annotated[Path, typer.Argument(help="cloud or mesh to re
     _describe_map(out, prior)
 
 
-@map_app.command("info")
-def map_info(file: Annotated[Path, typer.Argument(help="map file")]) -> None:
-    """Say what a map holds.
+@map_app.command('info')
+def map_info(file: Annotated[Path, typer.Argument(help='map file')]) -> None:
+    """
+    Say what a map holds.
 
     Example: `continuum-loc map info map.npz`
     """
@@ -354,10 +512,12 @@ def map_info(file: Annotated[Path, typer.Argument(help="map file")]) -> None:
 
 def _describe_map(path: Path, prior: Any) -> None:
     low, high = prior.points.min(axis=0), prior.points.max(axis=0)
-    box = " x ".join(f"{a:.2f}..{b:.2f}" for a, b in zip(low, high, strict=True))
-    console.print(f"{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, mean planarity "
-                  f"{prior.planarity.mean():.2f}, normals {'outward' if prior.oriented else 'of either sign'}",
-                  highlight=False)
+    box = ' x '.join(f'{a:.2f}..{b:.2f}' for a, b in zip(low, high, strict=True))
+    console.print(
+        f'{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, mean planarity '
+        f'{prior.planarity.mean():.2f}, normals {"outward" if prior.oriented else "of either sign"}',
+        highlight=False,
+    )
 
 
 def _write_report(folder: Path) -> Path:
@@ -365,7 +525,7 @@ def _write_report(folder: Path) -> Path:
     from continuum_loc.evaluation.runs import load_run
 
     with _busy() as status:
-        status.update("writing the report")
+        status.update('writing the report')
         run = load_run(folder)
         return write_report(run, context_of(run))
 
@@ -375,37 +535,50 @@ def _run_table(summary: dict[str, Any]) -> Any:
     from rich.table import Table
 
     def cells(entry: dict[str, Any]) -> list[str]:
-        return [_figure(entry["translation_mae_m"], 100), _figure(entry["translation_rmse_m"], 100),
-                _figure(entry["rotation_mae_deg"]), _figure(entry["rotation_rmse_deg"]),
-                _figure(entry["nees_per_dof"]), _figure(entry["coverage_95"], 100)]
+        return [
+            _figure(entry['translation_mae_m'], 100),
+            _figure(entry['translation_rmse_m'], 100),
+            _figure(entry['rotation_mae_deg']),
+            _figure(entry['rotation_rmse_deg']),
+            _figure(entry['nees_per_dof']),
+            _figure(entry['coverage_95'], 100),
+        ]
 
-    table = Table(caption=_speed(summary), caption_justify="left", show_edge=False)
-    for name in ("", "MAE cm", "RMSE cm", "MAE deg", "RMSE deg", "NEES/dof", "in 95 %, %"):
-        table.add_column(name, justify="right" if name else "left")
-    for ring, entry in summary["rings"].items():
+    table = Table(caption=_speed(summary), caption_justify='left', show_edge=False)
+    for name in ('', 'MAE cm', 'RMSE cm', 'MAE deg', 'RMSE deg', 'NEES/dof', 'in 95 %, %'):
+        table.add_column(name, justify='right' if name else 'left')
+    for ring, entry in summary['rings'].items():
         table.add_row(ring, *cells(entry))
     table.add_section()
-    table.add_row("all rings", *cells(summary), style="bold")
+    table.add_row('all rings', *cells(summary), style='bold')
     return table
 
 
 def _speed(summary: dict[str, Any]) -> str:
-    said = [f"real-time factor {_figure(summary['real_time_factor'])}",
-            f"step p99 {_figure(summary['step_ms']['p99'])} ms"]
-    if "latency_ms" in summary:
-        said.append(f"live latency p95 {_figure(summary['latency_ms']['p95'])} ms")
-    return ", ".join(said)
+    said = [
+        f'real-time factor {_figure(summary["real_time_factor"])}',
+        f'step p99 {_figure(summary["step_ms"]["p99"])} ms',
+    ]
+    if 'latency_ms' in summary:
+        said.append(f'live latency p95 {_figure(summary["latency_ms"]["p95"])} ms')
+    return ', '.join(said)
 
 
 def _claims_table(claims: list[Claim]) -> Any:
     from rich.table import Table
 
     table = Table(show_edge=False)
-    for name, justify in (("claim", "left"), ("value", "right"), ("unit", "left"), ("bound", "left"), ("", "left")):
+    for name, justify in (
+        ('claim', 'left'),
+        ('value', 'right'),
+        ('unit', 'left'),
+        ('bound', 'left'),
+        ('', 'left'),
+    ):
         table.add_column(name, justify=justify)
     for claim in claims:
-        verdict = "[green]holds[/]" if claim.holds else "[bold red]FAILS[/]"
-        table.add_row(claim.name, f"{claim.value:.4g}", claim.unit, claim.bound, verdict)
+        verdict = '[green]holds[/]' if claim.holds else '[bold red]FAILS[/]'
+        table.add_row(claim.name, f'{claim.value:.4g}', claim.unit, claim.bound, verdict)
     return table
 
 
@@ -421,27 +594,31 @@ def _text_table(rows: list[dict[str, str]]) -> Any:
 def _count_table(counts: dict[str, int], title: str) -> None:
     from rich.table import Table
 
-    table = Table("topic", "messages", title=title, title_justify="left", show_edge=False)
+    table = Table('topic', 'messages', title=title, title_justify='left', show_edge=False)
     for topic, count in sorted(counts.items()):
-        table.add_row(topic, f"{count:,}")
+        table.add_row(topic, f'{count:,}')
     console.print(table)
 
 
 def _figure(value: float | None, scale: float = 1.0) -> str:
-    return "-" if value is None else f"{scale * value:.2f}"
+    return '-' if value is None else f'{scale * value:.2f}'
 
 
 def _busy() -> Any:
     """A spinner whose text says what is going on."""
-    return errors.status("")
+    return errors.status('')
 
 
 def _progress(samples: Any, label: str, seconds: float | None) -> Any:
     """Pass samples on, with a bar over the time that their stamps span."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.1f} s"),
-               TimeRemainingColumn())
+    columns = (
+        TextColumn('{task.description}'),
+        BarColumn(),
+        TextColumn('{task.completed:.1f} s'),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=errors, transient=True) as progress:
         task, first, shown = progress.add_task(label, total=seconds), None, 0.0
         for sample in samples:
@@ -467,5 +644,5 @@ def _bag_duration(bag: Path) -> float | None:
         return reader.duration * 1e-9
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

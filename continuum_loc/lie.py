@@ -1,13 +1,17 @@
-"""SO(3) and SE(3), batch first: every function takes leading batch axes and returns them.
+"""
+SO(3) and SE(3), batch first: every function takes leading batch axes and returns them.
 
 Conventions, which the whole package keeps:
 - `T_map_body` maps body coordinates to map coordinates, as (4, 4) homogeneous matrices.
 - se(3) vectors are [rho; phi]: translation (m) first, rotation (rad) second.
-- Perturbations act on the right: `T <- T @ exp(delta)`, so a covariance is in the body's own frame.
-- `left_jacobian(xi)` is J with exp(xi + d) = exp(J d) exp(xi); `right_jacobian(xi) = left_jacobian(-xi)`.
+- Perturbations act on the right: `T <- T @ exp(delta)`, so a covariance is in the body's own
+  frame.
+- `left_jacobian(xi)` is J with exp(xi + d) = exp(J d) exp(xi); `right_jacobian(xi) =
+  left_jacobian(-xi)`.
 
-The SE(3) Jacobians are polynomials in ad(xi) of degree four (its minimal polynomial is
-A (A^2 + phi^2)^2): closed forms above an angle of 0.5 rad, Taylor series below, where the closed forms cancel.
+The SE(3) Jacobians are polynomials in ad(xi) of degree four (its minimal polynomial is A (A^2 +
+phi^2)^2): closed forms above an angle of 0.5 rad, Taylor series below, where the closed forms
+cancel.
 """
 
 from __future__ import annotations
@@ -17,17 +21,44 @@ import numpy as np
 SMALL_ANGLE = 0.5
 
 # Taylor coefficients in phi^2 of the polynomials' coefficients, lowest order first.
-LEFT_SERIES = np.array([
-    [1 / 2, 0, -1 / 720, 1 / 20160, -1 / 1209600, 1 / 119750400, -1 / 17435658240],
-    [1 / 6, 0, -1 / 5040, 1 / 181440, -1 / 13305600, 1 / 1556755200, -1 / 261534873600],
-    [1 / 24, -1 / 360, 1 / 13440, -1 / 907200, 1 / 95800320, -1 / 14529715200, 1 / 2988969984000],
-    [1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200, 1 / 1245404160, -1 / 217945728000, 1 / 50812489728000],
-])
-INVERSE_SERIES = np.array([
-    [1 / 12, 0, -1 / 30240, -1 / 604800, -1 / 15966720, -691 / 326918592000, -1 / 14944849920],
-    [-1 / 720, -1 / 15120, -1 / 403200, -1 / 11975040, -691 / 261534873600, -1 / 12454041600,
-     -3617 / 1524374691840000],
-])
+LEFT_SERIES = np.array(
+    [
+        [1 / 2, 0, -1 / 720, 1 / 20160, -1 / 1209600, 1 / 119750400, -1 / 17435658240],
+        [1 / 6, 0, -1 / 5040, 1 / 181440, -1 / 13305600, 1 / 1556755200, -1 / 261534873600],
+        [
+            1 / 24,
+            -1 / 360,
+            1 / 13440,
+            -1 / 907200,
+            1 / 95800320,
+            -1 / 14529715200,
+            1 / 2988969984000,
+        ],
+        [
+            1 / 120,
+            -1 / 2520,
+            1 / 120960,
+            -1 / 9979200,
+            1 / 1245404160,
+            -1 / 217945728000,
+            1 / 50812489728000,
+        ],
+    ]
+)
+INVERSE_SERIES = np.array(
+    [
+        [1 / 12, 0, -1 / 30240, -1 / 604800, -1 / 15966720, -691 / 326918592000, -1 / 14944849920],
+        [
+            -1 / 720,
+            -1 / 15120,
+            -1 / 403200,
+            -1 / 11975040,
+            -691 / 261534873600,
+            -1 / 12454041600,
+            -3617 / 1524374691840000,
+        ],
+    ]
+)
 
 
 def hat(v: np.ndarray) -> np.ndarray:
@@ -50,9 +81,11 @@ def so3_exp(phi: np.ndarray) -> np.ndarray:
 
 
 def so3_log(R: np.ndarray) -> np.ndarray:
-    """Rotation vectors (..., 3) in rad, angle in [0, pi], of rotation matrices (..., 3, 3).
+    """
+    Rotation vectors (..., 3) in rad, angle in [0, pi], of rotation matrices (..., 3, 3).
 
-    Goes through the quaternion whose largest component divides, which is exact near 0 and near pi alike.
+    Goes through the quaternion whose largest component divides, which is exact near 0 and near pi
+    alike.
     """
     R = np.asarray(R, float)
     q = _quaternion(R)
@@ -68,8 +101,15 @@ def _quaternion(R: np.ndarray) -> np.ndarray:
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     d, e, f = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    forms = np.stack([np.stack([1 + xx + yy + zz, a, b, c], -1), np.stack([a, 1 + xx - yy - zz, d, e], -1),
-                      np.stack([b, d, 1 - xx + yy - zz, f], -1), np.stack([c, e, f, 1 - xx - yy + zz], -1)], -2)
+    forms = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, a, b, c], -1),
+            np.stack([a, 1 + xx - yy - zz, d, e], -1),
+            np.stack([b, d, 1 - xx + yy - zz, f], -1),
+            np.stack([c, e, f, 1 - xx - yy + zz], -1),
+        ],
+        -2,
+    )
     best = np.argmax(np.diagonal(forms, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(forms, best[..., None, None], axis=-2)[..., 0, :]
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -118,7 +158,9 @@ def ad(xi: np.ndarray) -> np.ndarray:
 def left_jacobian(xi: np.ndarray) -> np.ndarray:
     """(..., 6, 6) left Jacobian of SE(3)."""
     xi = np.asarray(xi, float)
-    return _polynomial(xi, (np.ones(xi.shape[:-1]), *_left_coefficients(np.linalg.norm(xi[..., 3:], axis=-1))))
+    return _polynomial(
+        xi, (np.ones(xi.shape[:-1]), *_left_coefficients(np.linalg.norm(xi[..., 3:], axis=-1)))
+    )
 
 
 def right_jacobian(xi: np.ndarray) -> np.ndarray:
@@ -154,7 +196,9 @@ def _so3_left_jacobian(phi: np.ndarray) -> np.ndarray:
     skew = hat(phi)
     small = angle < 1e-2
     safe = np.where(small, 1.0, angle)
-    third = np.where(small, 1 / 6 - angle**2 / 120 + angle**4 / 5040, (safe - np.sin(safe)) / safe**3)
+    third = np.where(
+        small, 1 / 6 - angle**2 / 120 + angle**4 / 5040, (safe - np.sin(safe)) / safe**3
+    )
     return np.eye(3) + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * skew + third * (skew @ skew)
 
 
@@ -180,9 +224,16 @@ def _left_coefficients(angle: np.ndarray) -> list[np.ndarray]:
     small = angle < SMALL_ANGLE
     f = np.where(small, 1.0, angle)
     s, c = np.sin(f), np.cos(f)
-    closed = ((4 - f * s - 4 * c) / (2 * f**2), (4 * f - 5 * s + f * c) / (2 * f**3),
-              (2 - f * s - 2 * c) / (2 * f**4), (2 * f - 3 * s + f * c) / (2 * f**5))
-    return [np.where(small, _series(series, angle), value) for series, value in zip(LEFT_SERIES, closed, strict=True)]
+    closed = (
+        (4 - f * s - 4 * c) / (2 * f**2),
+        (4 * f - 5 * s + f * c) / (2 * f**3),
+        (2 - f * s - 2 * c) / (2 * f**4),
+        (2 * f - 3 * s + f * c) / (2 * f**5),
+    )
+    return [
+        np.where(small, _series(series, angle), value)
+        for series, value in zip(LEFT_SERIES, closed, strict=True)
+    ]
 
 
 def _inverse_coefficients(angle: np.ndarray) -> list[np.ndarray]:
@@ -193,8 +244,10 @@ def _inverse_coefficients(angle: np.ndarray) -> list[np.ndarray]:
     h = half / np.tan(half)
     slope = 0.5 * (h - (half / np.sin(half)) ** 2)  # phi h'(phi) / 2
     closed = ((2 * (1 - h) + slope) / f**2, (slope - h + 1) / f**4)
-    return [np.where(small, _series(series, angle), value)
-            for series, value in zip(INVERSE_SERIES, closed, strict=True)]
+    return [
+        np.where(small, _series(series, angle), value)
+        for series, value in zip(INVERSE_SERIES, closed, strict=True)
+    ]
 
 
 def _series(coefficients: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -1,24 +1,25 @@
-"""SE(3) for compiled loops: one element at a time, results written into the caller's arrays.
+"""
+SE(3) for compiled loops: one element at a time, results written into the caller's arrays.
 
-Same conventions as `continuum_loc.lie`, which is the oracle of these functions in the tests. Beyond it,
-`*_jacobian_times` give the exact derivative of J(xi) w with respect to xi, which the Gaussian-process
-factors and the interpolation need. Arrays are float64 and C-contiguous; no function allocates.
+Same conventions as `continuum_loc.lie`, which is the oracle of these functions in the tests.
+Beyond it, `*_jacobian_times` give the exact derivative of J(xi) w with respect to xi, which the
+Gaussian-process factors and the interpolation need. Arrays are float64 and C-contiguous; no
+function allocates.
 
-Everything that the adjoint generates has the form [[X, Y], [0, X]], so a product of two costs three 3x3
-products; `_block_product` uses that.
+Everything that the adjoint generates has the form [[X, Y], [0, X]], so a product of two costs
+three 3x3 products; `_block_product` uses that.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-from numba import njit
-
 from continuum_loc.lie import INVERSE_SERIES, LEFT_SERIES, SMALL_ANGLE
+from numba import njit
+import numpy as np
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline='always')
 def _hat_into(out, row, column, x, y, z):
     """Write the skew matrix of (x, y, z) into the 3x3 block of `out` at (row, column)."""
     out[row, column] = 0.0
@@ -34,7 +35,7 @@ def _hat_into(out, row, column, x, y, z):
 
 @njit(cache=True)
 def ad(x, out):
-    """out (6, 6) = ad(x) of x (6,)."""
+    """Out (6, 6) = ad(x) of x (6,)."""
     _hat_into(out, 0, 0, x[3], x[4], x[5])
     _hat_into(out, 3, 3, x[3], x[4], x[5])
     _hat_into(out, 0, 3, x[0], x[1], x[2])
@@ -43,7 +44,7 @@ def ad(x, out):
 
 @njit(cache=True)
 def bracket(x, y, out):
-    """out (6,) = ad(x) y."""
+    """Out (6,) = ad(x) y."""
     out[0] = x[4] * y[2] - x[5] * y[1] + x[1] * y[5] - x[2] * y[4]
     out[1] = x[5] * y[0] - x[3] * y[2] + x[2] * y[3] - x[0] * y[5]
     out[2] = x[3] * y[1] - x[4] * y[0] + x[0] * y[4] - x[1] * y[3]
@@ -54,7 +55,7 @@ def bracket(x, y, out):
 
 @njit(cache=True)
 def block_product(A, B, out):
-    """out = A B for matrices of the form [[X, Y], [0, X]]."""
+    """Out = A B for matrices of the form [[X, Y], [0, X]]."""
     for i in range(3):
         for j in range(3):
             x = 0.0
@@ -70,7 +71,7 @@ def block_product(A, B, out):
 
 @njit(cache=True)
 def product(A, B, out):
-    """out (6, 6) = A B."""
+    """Out (6, 6) = A B."""
     for i in range(6):
         for j in range(6):
             total = 0.0
@@ -81,7 +82,7 @@ def product(A, B, out):
 
 @njit(cache=True)
 def apply(A, x, out):
-    """out (6,) = A x."""
+    """Out (6,) = A x."""
     for i in range(6):
         total = 0.0
         for k in range(6):
@@ -124,7 +125,7 @@ def exp(x, T):
 
 @njit(cache=True)
 def log(T, x):
-    """x (6,) = log(T), angle in [0, pi], through the quaternion whose largest component divides."""
+    """X (6,) = log(T), angle in [0, pi], through the quaternion whose largest component divides."""
     xx, yy, zz = T[0, 0], T[1, 1], T[2, 2]
     a, b, c = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
     trace = xx + yy + zz
@@ -160,19 +161,22 @@ def log(T, x):
 
 @njit(cache=True)
 def relative(Ta, Tb, out):
-    """out (4, 4) = Ta^-1 Tb."""
+    """Out (4, 4) = Ta^-1 Tb."""
     for i in range(3):
         for j in range(3):
             out[i, j] = Ta[0, i] * Tb[0, j] + Ta[1, i] * Tb[1, j] + Ta[2, i] * Tb[2, j]
-        out[i, 3] = (Ta[0, i] * (Tb[0, 3] - Ta[0, 3]) + Ta[1, i] * (Tb[1, 3] - Ta[1, 3])
-                     + Ta[2, i] * (Tb[2, 3] - Ta[2, 3]))
+        out[i, 3] = (
+            Ta[0, i] * (Tb[0, 3] - Ta[0, 3])
+            + Ta[1, i] * (Tb[1, 3] - Ta[1, 3])
+            + Ta[2, i] * (Tb[2, 3] - Ta[2, 3])
+        )
         out[3, i] = 0.0
     out[3, 3] = 1.0
 
 
 @njit(cache=True)
 def compose(Ta, Tb, out):
-    """out (4, 4) = Ta Tb; `out` must not be one of them."""
+    """Out (4, 4) = Ta Tb; `out` must not be one of them."""
     for i in range(3):
         for j in range(3):
             out[i, j] = Ta[i, 0] * Tb[0, j] + Ta[i, 1] * Tb[1, j] + Ta[i, 2] * Tb[2, j]
@@ -183,7 +187,7 @@ def compose(Ta, Tb, out):
 
 @njit(cache=True)
 def adjoint(T, out):
-    """out (6, 6) = Ad(T)."""
+    """Out (6, 6) = Ad(T)."""
     for j in range(3):
         for i in range(3):
             out[i, j] = T[i, j]
@@ -209,7 +213,7 @@ def _taylor(series, square, value, slope):
 
 @njit(cache=True)
 def right_coefficients(x, c, dc):
-    """c (5,): J_r(x) = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
+    """C (5,): J_r(x) = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0] = 1.0
@@ -232,7 +236,7 @@ def right_coefficients(x, c, dc):
 
 @njit(cache=True)
 def right_inverse_coefficients(x, c, dc):
-    """c (5,): J_r(x)^-1 = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
+    """C (5,): J_r(x)^-1 = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0], c[1], c[3] = 1.0, 0.5, 0.0
@@ -254,7 +258,7 @@ def right_inverse_coefficients(x, c, dc):
 
 @njit(cache=True)
 def polynomial(c, A, out, work):
-    """out = c0 I + c1 A + ... + c4 A^4 by Horner's rule, A of the form [[X, Y], [0, X]]; work (6, 6)."""
+    """Out = c0 I + c1 A + ... + c4 A^4 by Horner's rule, A of the form [[X, Y], [0, X]]; work (6, 6)."""
     out[:, :] = 0.0
     for i in range(6):
         out[i, i] = c[4]
@@ -268,10 +272,11 @@ def polynomial(c, A, out, work):
 
 @njit(cache=True)
 def polynomial_times(c, dc, x, A, w, value, derivative, work, vectors):
-    """value (6,) = f(A) w and derivative (6, 6) = d(f(ad(x)) w)/dx for f(A) = sum c_i A^i, A = ad(x).
+    """
+    Value (6,) = f(A) w and derivative (6, 6) = d(f(ad(x)) w)/dx for f(A) = sum c_i A^i, A = ad(x).
 
-    With w_i = A^i w: d(w_i)/dx = D_i, D_1 = -ad(w), D_{i+1} = A D_i - ad(w_i); the coefficients themselves
-    add sum (c_i'/phi) w_i [0; phi]^T. work (2, 6, 6), vectors (5, 6).
+    With w_i = A^i w: d(w_i)/dx = D_i, D_1 = -ad(w), D_{i+1} = A D_i - ad(w_i); the coefficients
+    themselves add sum (c_i'/phi) w_i [0; phi]^T. work (2, 6, 6), vectors (5, 6).
     """
     for i in range(6):
         vectors[0, i] = w[i]

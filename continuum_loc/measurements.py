@@ -1,7 +1,9 @@
-"""Stamped sensor samples, as plain arrays: what `msg_tools` makes of messages and the estimator consumes.
+"""
+Stamped sensor samples, as plain arrays: what `msg_tools` makes of messages and the estimator
+consumes.
 
-Stamps are integer nanoseconds of the sensor's own clock (the message header), never the arrival time.
-All arrays are SI. Nothing here knows ROS.
+Stamps are integer nanoseconds of the sensor's own clock (the message header), never the arrival
+time. All arrays are SI. Nothing here knows ROS.
 """
 
 from __future__ import annotations
@@ -30,11 +32,15 @@ def nanoseconds(time: float) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TofFrame:
-    """One frame of one multizone time-of-flight sensor.
+    """
+    One frame of one multizone time-of-flight sensor.
 
-    points: (Z, 3) in the sensor frame, x along the optical axis, metres; not finite where no return.
-    ranges: (Z,) distance along the ray, metres: -inf too close, +inf no return, nan invalid (REP-117).
-    sigma: (Z,) standard deviation the sensor states for each range, metres (nan where it states none).
+    points: (Z, 3) in the sensor frame, x along the optical axis, metres; not finite where no
+    return.
+    ranges: (Z,) distance along the ray, metres: -inf too close, +inf no return, nan invalid
+    (REP-117).
+    sigma: (Z,) standard deviation the sensor states for each range, metres (nan where it states
+    none).
     status: (Z,) uint8, VL53L5CX target status (5 valid; 6 and 9 valid at half confidence).
     """
 
@@ -58,10 +64,12 @@ class ImuSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrainSample:
-    """Bending at M stations: arclength s (M,) m, bending-plane angle theta (M,) rad, curvature kappa (M,) 1/m.
+    """
+    Bending at M stations: arclength s (M,) m, bending-plane angle theta (M,) rad, curvature kappa
+    (M,) 1/m.
 
-    As in the paper's eqs. 7-8 the strain is Ad(Rx(theta)) [1 0 0 0 0 kappa]: the rotational strain is
-    kappa * (0, -sin theta, cos theta).
+    As in the paper's eqs. 7-8 the strain is Ad(Rx(theta)) [1 0 0 0 0 kappa]: the rotational strain
+    is kappa * (0, -sin theta, cos theta).
     """
 
     stamp: int
@@ -81,8 +89,11 @@ class FieldSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPose:
-    """An external tracker's pose of a sensor: T_map_sensor (4, 4), covariance (6, 6) in [rho; phi] order of
-    a right (sensor-frame) perturbation; all-zero covariance means the tracker states none."""
+    """
+    An external tracker's pose of a sensor: T_map_sensor (4, 4), covariance (6, 6) in [rho; phi]
+    order of a right (sensor-frame) perturbation; all-zero covariance means the tracker states
+    none.
+    """
 
     stamp: int
     sensor: str

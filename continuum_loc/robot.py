@@ -1,4 +1,5 @@
-"""The robot description: geometry, sensors and datasheet noise, from one validated YAML file.
+"""
+The robot description: geometry, sensors and datasheet noise, from one validated YAML file.
 
 It serves the simulator and the estimator alike. What only the true plant knows (stiffness, mass,
 friction, faults) lives in the simulator's plant files, so that the estimator cannot peek.
@@ -13,33 +14,36 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from continuum_loc.settings import load_bundled, Settings
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
-from continuum_loc.settings import Settings, load_bundled
-
-ROBOTS_FOLDER = Path(__file__).parent / "robots"
+ROBOTS_FOLDER = Path(__file__).parent / 'robots'
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 
 
 class Mount(Settings):
-    """Where a sensor sits on its ring: either `azimuth_deg` and `radius` (radial, looking outward),
-    or `xyz` (m) and `rpy_deg` (fixed-axis roll, pitch, yaw) in the ring's frame."""
+    """
+    Where a sensor sits on its ring: either `azimuth_deg` and `radius` (radial, looking outward),
+    or `xyz` (m) and `rpy_deg` (fixed-axis roll, pitch, yaw) in the ring's frame.
+    """
 
-    azimuth_deg: float | None = Field(None, description="angle about the tangent x, from body y towards z [deg]")
-    radius: float | None = Field(None, ge=0.0, description="distance from the backbone [m]")
-    xyz: Vector3 | None = Field(None, description="position in the ring frame [m]")
-    rpy_deg: Vector3 | None = Field(None, description="fixed-axis roll, pitch, yaw [deg]")
+    azimuth_deg: float | None = Field(
+        None, description='angle about the tangent x, from body y towards z [deg]'
+    )
+    radius: float | None = Field(None, ge=0.0, description='distance from the backbone [m]')
+    xyz: Vector3 | None = Field(None, description='position in the ring frame [m]')
+    rpy_deg: Vector3 | None = Field(None, description='fixed-axis roll, pitch, yaw [deg]')
 
-    @model_validator(mode="after")
+    @model_validator(mode='after')
     def _one_form(self) -> Mount:
         radial = (self.azimuth_deg is not None, self.radius is not None)
         explicit = (self.xyz is not None, self.rpy_deg is not None)
         if not (all(radial) and not any(explicit)) and not (all(explicit) and not any(radial)):
-            raise ValueError("give either both azimuth_deg and radius, or both xyz and rpy_deg")
+            raise ValueError('give either both azimuth_deg and radius, or both xyz and rpy_deg')
         return self
 
     @property
@@ -47,12 +51,15 @@ class Mount(Settings):
         """(4, 4) transform from the sensor frame to the ring frame."""
         T_ring_sensor = np.eye(4)
         if self.xyz is not None:
-            T_ring_sensor[:3, :3] = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+            T_ring_sensor[:3, :3] = Rotation.from_euler(
+                'xyz', self.rpy_deg, degrees=True
+            ).as_matrix()
             T_ring_sensor[:3, 3] = self.xyz
             return T_ring_sensor
         angle = np.radians(self.azimuth_deg)
         outward = np.array([0.0, np.cos(angle), np.sin(angle)])
-        # Sensor x looks outward and sensor y lies along the tangent, so rows of zones run along the robot.
+        # Sensor x looks outward and sensor y lies along the tangent, so rows of zones run along
+        # the robot.
         tangent = np.array([1.0, 0.0, 0.0])
         T_ring_sensor[:3, :3] = np.column_stack([outward, tangent, np.cross(outward, tangent)])
         T_ring_sensor[:3, 3] = self.radius * outward
@@ -71,16 +78,18 @@ class Ring(Settings):
     """A sensor disc at unstretched arclength `s` from the base."""
 
     name: str
-    s: float = Field(ge=0.0, description="arclength from the base [m]")
+    s: float = Field(ge=0.0, description='arclength from the base [m]')
 
 
 class Insertion(Settings):
     """The base's travel along its own x axis."""
 
-    mode: Literal["fixed", "measured", "unknown"] = Field(
-        "fixed", description="fixed at 0; measured by the `insertion` joint state; or unknown within `range`")
-    range: tuple[float, float] = Field((0.0, 0.0), description="least and greatest travel [m]")
-    sigma: float = Field(0.0005, gt=0.0, description="standard deviation of the encoder [m]")
+    mode: Literal['fixed', 'measured', 'unknown'] = Field(
+        'fixed',
+        description='fixed at 0; measured by the `insertion` joint state; or unknown within `range`',
+    )
+    range: tuple[float, float] = Field((0.0, 0.0), description='least and greatest travel [m]')
+    sigma: float = Field(0.0005, gt=0.0, description='standard deviation of the encoder [m]')
 
 
 class Base(Settings):
@@ -88,34 +97,39 @@ class Base(Settings):
 
     xyz: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
-    sigma_position: float = Field(0.0005, gt=0.0, description="standard deviation of the base position [m]")
-    sigma_rotation_deg: float = Field(0.1, gt=0.0, description="standard deviation of the base rotation [deg]")
+    sigma_position: float = Field(
+        0.0005, gt=0.0, description='standard deviation of the base position [m]'
+    )
+    sigma_rotation_deg: float = Field(
+        0.1, gt=0.0, description='standard deviation of the base rotation [deg]'
+    )
     insertion: Insertion = Insertion()
 
     @cached_property
     def T_map_base(self) -> np.ndarray:
         """(4, 4) base pose at zero insertion."""
         T_map_base = np.eye(4)
-        T_map_base[:3, :3] = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+        T_map_base[:3, :3] = Rotation.from_euler('xyz', self.rpy_deg, degrees=True).as_matrix()
         T_map_base[:3, 3] = self.xyz
         return T_map_base
 
 
 class Backbone(Settings):
-    """The shape prior: rest strain [nu; omega] and how far each component departs from it (1 sigma).
+    """
+    The shape prior: rest strain [nu; omega] and how far each component departs from it (1 sigma).
 
-    Small sigmas on extension and shear make a Kirchhoff rod, a loose first component an extensible arm,
-    a small fourth component a twist-free tendon robot.
+    Small sigmas on extension and shear make a Kirchhoff rod, a loose first component an extensible
+    arm, a small fourth component a twist-free tendon robot.
     """
 
     rest_strain: Vector6 = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     rest_strain_sigma: Vector6 = (0.002, 0.002, 0.002, 0.02, 4.0, 4.0)
 
-    @field_validator("rest_strain_sigma")
+    @field_validator('rest_strain_sigma')
     @classmethod
     def _positive(cls, value: Vector6) -> Vector6:
         if min(value) <= 0.0:
-            raise ValueError("every component must be greater than 0")
+            raise ValueError('every component must be greater than 0')
         return value
 
 
@@ -124,32 +138,36 @@ class TofModel(Settings):
 
     rows: int = Field(8, ge=1)
     columns: int = Field(8, ge=1)
-    fov_deg: float = Field(45.0, gt=0.0, lt=170.0, description="full square field of view [deg]")
-    grid: Literal["uniform_tangent", "uniform_angle"] = "uniform_tangent"
-    flip_rows: bool = Field(False, description="the lens of a mounted VL53L5CX flips both")
+    fov_deg: float = Field(45.0, gt=0.0, lt=170.0, description='full square field of view [deg]')
+    grid: Literal['uniform_tangent', 'uniform_angle'] = 'uniform_tangent'
+    flip_rows: bool = Field(False, description='the lens of a mounted VL53L5CX flips both')
     flip_columns: bool = False
-    convention: Literal["range", "perpendicular"] = Field(
-        "range", description="what the raw distance means: along the ray, or along the optical axis")
-    rate: float = Field(15.0, gt=0.0, description="frames per second")
-    min_range: float = Field(0.025, ge=0.0, description="closer returns are invalid [m]")
-    max_range: float = Field(4.0, gt=0.0, description="farther returns are none [m]")
+    convention: Literal['range', 'perpendicular'] = Field(
+        'range',
+        description='what the raw distance means: along the ray, or along the optical axis',
+    )
+    rate: float = Field(15.0, gt=0.0, description='frames per second')
+    min_range: float = Field(0.025, ge=0.0, description='closer returns are invalid [m]')
+    max_range: float = Field(4.0, gt=0.0, description='farther returns are none [m]')
     # Table I of the paper: sigma = coefficient(d) * d, the coefficient interpolated linearly.
     noise_distance: tuple[float, ...] = (0.025, 0.6, 1.2)
     noise_coefficient: tuple[float, ...] = (0.014, 0.012, 0.006)
 
     @cached_property
     def directions(self) -> np.ndarray:
-        """(rows * columns, 3) unit rays in the sensor frame (x optical axis), row-major; columns step along
-        sensor y, rows along sensor z."""
+        """
+        (rows * columns, 3) unit rays in the sensor frame (x optical axis), row-major; columns step
+        along sensor y, rows along sensor z.
+        """
         half = np.radians(self.fov_deg) / 2.0
 
         def centres(count: int) -> np.ndarray:
             unit = (np.arange(count) + 0.5) / count * 2.0 - 1.0
-            return unit * np.tan(half) if self.grid == "uniform_tangent" else np.tan(unit * half)
+            return unit * np.tan(half) if self.grid == 'uniform_tangent' else np.tan(unit * half)
 
         columns = centres(self.columns)[:: -1 if self.flip_columns else 1]
         rows = centres(self.rows)[:: -1 if self.flip_rows else 1]
-        z, y = np.meshgrid(rows, columns, indexing="ij")
+        z, y = np.meshgrid(rows, columns, indexing='ij')
         rays = np.stack([np.ones_like(y), y, z], axis=-1).reshape(-1, 3)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
@@ -161,30 +179,36 @@ class TofModel(Settings):
 class ImuModel(Settings):
     """Datasheet of a gyro and accelerometer."""
 
-    rate: float = Field(100.0, gt=0.0, description="samples per second")
-    gyro_sigma: float = Field(0.01, gt=0.0, description="white noise of one sample [rad/s]")
-    gyro_bias_sigma: float = Field(0.0, ge=0.0, description="spread of the constant zero-rate offset [rad/s]")
-    gyro_range: float = Field(8.73, gt=0.0, description="full scale [rad/s]")
-    accel_sigma: float = Field(0.05, gt=0.0, description="white noise of one sample [m/s^2]")
-    accel_range: float = Field(39.2, gt=0.0, description="full scale [m/s^2]")
+    rate: float = Field(100.0, gt=0.0, description='samples per second')
+    gyro_sigma: float = Field(0.01, gt=0.0, description='white noise of one sample [rad/s]')
+    gyro_bias_sigma: float = Field(
+        0.0, ge=0.0, description='spread of the constant zero-rate offset [rad/s]'
+    )
+    gyro_range: float = Field(8.73, gt=0.0, description='full scale [rad/s]')
+    accel_sigma: float = Field(0.05, gt=0.0, description='white noise of one sample [m/s^2]')
+    accel_range: float = Field(39.2, gt=0.0, description='full scale [m/s^2]')
 
 
 class StrainModel(Settings):
     """An FBG-like strain sensor down the backbone."""
 
-    spacing: float = Field(0.03, gt=0.0, description="distance between stations [m]")
-    rate: float = Field(20.0, gt=0.0, description="samples per second")
-    kappa_sigma: float = Field(0.01, gt=0.0, description="white noise of the curvature [1/m]")
-    theta_sigma: float = Field(0.015, gt=0.0, description="white noise of the bending-plane angle [rad]")
+    spacing: float = Field(0.03, gt=0.0, description='distance between stations [m]')
+    rate: float = Field(20.0, gt=0.0, description='samples per second')
+    kappa_sigma: float = Field(0.01, gt=0.0, description='white noise of the curvature [1/m]')
+    theta_sigma: float = Field(
+        0.015, gt=0.0, description='white noise of the bending-plane angle [rad]'
+    )
 
 
 class HallModel(Settings):
     """Datasheet of a three-axis Hall sensor (MLX90393 at GAIN 7, RES 0 unless changed)."""
 
-    rate: float = Field(100.0, gt=0.0, description="samples per second")
-    sigma: float = Field(1e-6, gt=0.0, description="white noise of one sample [T]")
-    lsb: Vector3 = Field((0.150e-6, 0.150e-6, 0.242e-6), description="quantisation step per axis [T]")
-    saturation: Vector3 = Field((4.9e-3, 4.9e-3, 7.9e-3), description="full scale per axis [T]")
+    rate: float = Field(100.0, gt=0.0, description='samples per second')
+    sigma: float = Field(1e-6, gt=0.0, description='white noise of one sample [T]')
+    lsb: Vector3 = Field(
+        (0.150e-6, 0.150e-6, 0.242e-6), description='quantisation step per axis [T]'
+    )
+    saturation: Vector3 = Field((4.9e-3, 4.9e-3, 7.9e-3), description='full scale per axis [T]')
 
 
 class Magnet(Settings):
@@ -193,7 +217,7 @@ class Magnet(Settings):
     length: float = Field(0.013, gt=0.0)
     inner_diameter: float = Field(0.010, ge=0.0)
     outer_diameter: float = Field(0.014, gt=0.0)
-    remanence: float = Field(1.45, description="signed: negative when mounted upside down [T]")
+    remanence: float = Field(1.45, description='signed: negative when mounted upside down [T]')
     s: float = Field(0.0, description="arclength of the magnet's centre [m]")
 
 
@@ -201,8 +225,8 @@ class RobotDescription(Settings):
     """Everything that simulator and estimator share about one robot."""
 
     name: str
-    length: float = Field(gt=0.0, description="unstretched backbone length [m]")
-    radius: float = Field(gt=0.0, description="outer radius of the body [m]")
+    length: float = Field(gt=0.0, description='unstretched backbone length [m]')
+    radius: float = Field(gt=0.0, description='outer radius of the body [m]')
     base: Base = Base()
     backbone: Backbone = Backbone()
     rings: tuple[Ring, ...] = Field(min_length=1)
@@ -216,27 +240,36 @@ class RobotDescription(Settings):
     magnet: Magnet | None = None
     trackers: tuple[Sensor, ...] = ()
 
-    @model_validator(mode="after")
+    @model_validator(mode='after')
     def _consistent(self) -> RobotDescription:
         arclengths = [ring.s for ring in self.rings]
         if any(b - a < 1e-6 for a, b in zip(arclengths, arclengths[1:], strict=False)):
-            raise ValueError(f"rings must be listed from base to tip without overlap, got s = {arclengths}")
+            raise ValueError(
+                f'rings must be listed from base to tip without overlap, got s = {arclengths}'
+            )
         if arclengths[-1] > self.length + 1e-9:
-            raise ValueError(f"ring '{self.rings[-1].name}' at s = {arclengths[-1]} lies beyond the length "
-                             f"{self.length}")
+            raise ValueError(
+                f"ring '{self.rings[-1].name}' at s = {arclengths[-1]} lies beyond the length "
+                f'{self.length}'
+            )
         names = [sensor.name for sensor in self.sensors] + [ring.name for ring in self.rings]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
-            raise ValueError(f"names must be unique, used more than once: {', '.join(doubled)}")
+            raise ValueError(f'names must be unique, used more than once: {", ".join(doubled)}')
         for sensor in self.sensors:
             if sensor.ring not in self.ring_names:
-                raise ValueError(f"sensor '{sensor.name}' is on unknown ring '{sensor.ring}'; "
-                                 f"rings: {', '.join(self.ring_names)}")
+                raise ValueError(
+                    f"sensor '{sensor.name}' is on unknown ring '{sensor.ring}'; "
+                    f'rings: {", ".join(self.ring_names)}'
+                )
         for sensor in self.tof:
             if np.linalg.norm(sensor.mount.T_ring_sensor[1:3, 3]) < self.radius - 1e-9 and (
-                    sensor.mount.T_ring_sensor[0, 0] < 0.5):
-                raise ValueError(f"ToF sensor '{sensor.name}' sits inside the body (radius {self.radius} m) and looks "
-                                 "sideways: move it to the surface or beyond")
+                sensor.mount.T_ring_sensor[0, 0] < 0.5
+            ):
+                raise ValueError(
+                    f"ToF sensor '{sensor.name}' sits inside the body (radius {self.radius} m) and looks "
+                    'sideways: move it to the surface or beyond'
+                )
         return self
 
     @property
@@ -267,8 +300,10 @@ class RobotDescription(Settings):
         for sensor in self.sensors:
             if sensor.name == name:
                 return sensor
-        raise KeyError(f"robot '{self.name}' has no sensor '{name}'; sensors: "
-                       f"{', '.join(sensor.name for sensor in self.sensors)}")
+        raise KeyError(
+            f"robot '{self.name}' has no sensor '{name}'; sensors: "
+            f'{", ".join(sensor.name for sensor in self.sensors)}'
+        )
 
     def sensor_arclength(self, name: str) -> float:
         """Arclength [m] of the ring that carries the sensor."""
@@ -277,4 +312,4 @@ class RobotDescription(Settings):
 
 def load_robot(name_or_path: str | Path) -> RobotDescription:
     """A robot that comes with the package (`engine`, `soft_arm`, `hall_arm`), or one of your own from a YAML file."""
-    return load_bundled(RobotDescription, ROBOTS_FOLDER, name_or_path, "robot")
+    return load_bundled(RobotDescription, ROBOTS_FOLDER, name_or_path, 'robot')

@@ -1,7 +1,9 @@
-"""Typed settings read from YAML: one way to load them, one way to complain about them.
+"""
+Typed settings read from YAML: one way to load them, one way to complain about them.
 
-Every YAML file of the package (robot, plant, estimator, scene) is a `Settings` subclass. A key that
-does not exist is refused with the nearest valid name; a value out of range is refused with its place.
+Every YAML file of the package (robot, plant, estimator, scene) is a `Settings` subclass. A key
+that does not exist is refused with the nearest valid name; a value out of range is refused with
+its place.
 """
 
 from __future__ import annotations
@@ -10,8 +12,8 @@ import difflib
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
+import yaml
 
 
 class SettingsError(ValueError):
@@ -21,10 +23,10 @@ class SettingsError(ValueError):
 class Settings(BaseModel):
     """Base of all typed settings: immutable, and unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra='forbid', frozen=True, arbitrary_types_allowed=True)
 
 
-S = TypeVar("S", bound=Settings)
+S = TypeVar('S', bound=Settings)
 
 
 def load_settings(model: type[S], path: str | Path) -> S:
@@ -33,50 +35,51 @@ def load_settings(model: type[S], path: str | Path) -> S:
     try:
         data = yaml.safe_load(path.read_text())
     except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
+        raise SettingsError(f'{path}: cannot be read ({error.strerror})') from None
     except yaml.YAMLError as error:
-        raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        raise SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     return parse_settings(model, data if data is not None else {}, where=str(path))
 
 
 def load_bundled(model: type[S], folder: Path, name_or_path: str | Path, what: str) -> S:
-    """Settings that come with the package as `folder/NAME.yaml`, or from a YAML file of one's own.
+    """
+    Settings that come with the package as `folder/NAME.yaml`, or from a YAML file of one's own.
 
     what: what it is, for the error. Raises SettingsError listing the names that there are.
     """
     path = Path(name_or_path)
-    if path.suffix in (".yaml", ".yml"):
+    if path.suffix in ('.yaml', '.yml'):
         return load_settings(model, path)
-    bundled = folder / f"{name_or_path}.yaml"
+    bundled = folder / f'{name_or_path}.yaml'
     if not bundled.is_file():
-        names = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
+        names = ', '.join(sorted(file.stem for file in folder.glob('*.yaml')))
         raise SettingsError(f"no {what} '{name_or_path}': give a .yaml file, or one of {names}")
     return load_settings(model, bundled)
 
 
-def parse_settings(model: type[S], data: Any, where: str = "settings") -> S:
+def parse_settings(model: type[S], data: Any, where: str = 'settings') -> S:
     """Validate a mapping into `model`. `where` starts each line of the error."""
     if not isinstance(data, dict):
-        raise SettingsError(f"{where}: expected a mapping of keys, got {type(data).__name__}")
+        raise SettingsError(f'{where}: expected a mapping of keys, got {type(data).__name__}')
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        lines = [f"{where}: {_explain(model, item)}" for item in error.errors()]
-        raise SettingsError("\n".join(lines)) from None
+        lines = [f'{where}: {_explain(model, item)}' for item in error.errors()]
+        raise SettingsError('\n'.join(lines)) from None
 
 
 def dump_settings(settings: Settings, path: str | Path) -> None:
     """Write settings as YAML that `load_settings` reads back to an equal object."""
-    Path(path).write_text(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+    Path(path).write_text(yaml.safe_dump(settings.model_dump(mode='json'), sort_keys=False))
 
 
 def _explain(model: type[Settings], item: dict) -> str:
-    place = ".".join(str(part) for part in item["loc"]) or "(top level)"
-    if item["type"] != "extra_forbidden":
-        return f"{place}: {item['msg']} (got {item.get('input')!r})"
-    valid = _fields_at(model, item["loc"][:-1])
-    close = difflib.get_close_matches(str(item["loc"][-1]), valid, n=1, cutoff=0.0)
-    hint = f"; did you mean '{close[0]}'?" if close else ""
+    place = '.'.join(str(part) for part in item['loc']) or '(top level)'
+    if item['type'] != 'extra_forbidden':
+        return f'{place}: {item["msg"]} (got {item.get("input")!r})'
+    valid = _fields_at(model, item['loc'][:-1])
+    close = difflib.get_close_matches(str(item['loc'][-1]), valid, n=1, cutoff=0.0)
+    hint = f"; did you mean '{close[0]}'?" if close else ''
     return f"unknown key '{place}'{hint} Valid keys: {', '.join(sorted(valid))}"
 
 
@@ -100,7 +103,7 @@ def _is_model(candidate: Any) -> bool:
 def _inner_model(annotation: Any) -> Any:
     if _is_model(annotation):
         return annotation
-    for inner in getattr(annotation, "__args__", ()):
+    for inner in getattr(annotation, '__args__', ()):
         found = _inner_model(inner)
         if found is not None:
             return found

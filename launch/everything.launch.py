@@ -1,6 +1,7 @@
-"""Everything at once: live simulation, estimator, recorder and RViz.
+"""
+Everything at once: live simulation, estimator, recorder and RViz.
 
-    ros2 launch continuum_loc everything.launch.py map:=S0.npz
+ros2 launch continuum_loc everything.launch.py map:=S0.npz
 """
 
 from launch import LaunchDescription
@@ -9,24 +10,31 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
-SHARE = FindPackageShare("continuum_loc")
+SHARE = FindPackageShare('continuum_loc')
 ARGUMENTS = (
-    ("robot", "engine", "robot description: a bundled name or a YAML file"),
-    ("scene", "S0", "scene to simulate: S0-S9, R0-R4, or a mesh file"),
-    ("trajectory", "t1", "named motion of the robot"),
-    ("map", "", "prior map for the estimator: npz, PLY, PCD, XYZ, CSV or a mesh"),
-    ("bag", "everything", "folder of the bag to record; empty records none"),
-    ("rviz", "true", "start RViz"),
-    ("params_file", PathJoinSubstitution([SHARE, "config", "estimator.yaml"]), "parameters of the estimator (YAML)"),
-    ("use_sim_time", "false", "take the time from /clock; a live simulation keeps the wall clock"),
+    ('robot', 'engine', 'robot description: a bundled name or a YAML file'),
+    ('scene', 'S0', 'scene to simulate: S0-S9, R0-R4, or a mesh file'),
+    ('trajectory', 't1', 'named motion of the robot'),
+    ('map', '', 'prior map for the estimator: npz, PLY, PCD, XYZ, CSV or a mesh'),
+    ('bag', 'everything', 'folder of the bag to record; empty records none'),
+    ('rviz', 'true', 'start RViz'),
+    (
+        'params_file',
+        PathJoinSubstitution([SHARE, 'config', 'estimator.yaml']),
+        'parameters of the estimator (YAML)',
+    ),
+    ('use_sim_time', 'false', 'take the time from /clock; a live simulation keeps the wall clock'),
 )
 
 
 def generate_launch_description():
     """`live.launch.py` with recorder and RViz switched on."""
-    declared = [DeclareLaunchArgument(name, default_value=value, description=text)
-                for name, value, text in ARGUMENTS]
+    declared = [
+        DeclareLaunchArgument(name, default_value=value, description=text)
+        for name, value, text in ARGUMENTS
+    ]
     live = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(PathJoinSubstitution([SHARE, "launch", "live.launch.py"])),
-        launch_arguments={name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}.items())
+        PythonLaunchDescriptionSource(PathJoinSubstitution([SHARE, 'launch', 'live.launch.py'])),
+        launch_arguments={name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}.items(),
+    )
     return LaunchDescription([*declared, live])

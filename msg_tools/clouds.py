@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
+import numpy as np
 
 # sensor_msgs/PointField: datatype number -> NumPy scalar.
-DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _NUMBER = {np.dtype(code): number for number, code in DATATYPES.items()}
 
 
@@ -18,25 +17,44 @@ def cloud_message(make: Messages, header: Any, array: np.ndarray) -> Any:
     """PointCloud2 of a structured array, (H, W) organised or (N,) not. Fields are those of the dtype."""
     height, width = array.shape if array.ndim == 2 else (1, len(array))
     dtype = array.dtype
-    fields = [make("sensor_msgs/msg/PointField", name=name, offset=dtype.fields[name][1],
-                   datatype=_NUMBER[dtype.fields[name][0]], count=1) for name in dtype.names]
-    dense = bool(all(np.isfinite(array[name]).all() for name in "xyz"))
-    return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width, fields=fields,
-                is_bigendian=False, point_step=dtype.itemsize, row_step=dtype.itemsize * width,
-                data=make.octets(array), is_dense=dense)
+    fields = [
+        make(
+            'sensor_msgs/msg/PointField',
+            name=name,
+            offset=dtype.fields[name][1],
+            datatype=_NUMBER[dtype.fields[name][0]],
+            count=1,
+        )
+        for name in dtype.names
+    ]
+    dense = bool(all(np.isfinite(array[name]).all() for name in 'xyz'))
+    return make(
+        'sensor_msgs/msg/PointCloud2',
+        header=header,
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=False,
+        point_step=dtype.itemsize,
+        row_step=dtype.itemsize * width,
+        data=make.octets(array),
+        is_dense=dense,
+    )
 
 
 def cloud_array(message: Any, where: str) -> np.ndarray:
     """(H, W) structured array viewing the cloud's bytes. Raises ConvertError starting with `where`."""
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     _check_size(message, where)
-    rows = np.frombuffer(message.data, np.uint8).reshape(height, int(message.row_step))[:, : width * step]
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, int(message.row_step))[
+        :, : width * step
+    ]
     return np.ascontiguousarray(rows).view(cloud_dtype(message, where)).reshape(height, width)
 
 
 def cloud_dtype(message: Any, where: str) -> np.dtype:
     """The structured dtype which the cloud's fields describe."""
-    order = ">" if message.is_bigendian else "<"
+    order = '>' if message.is_bigendian else '<'
     step = int(message.point_step)
     names, formats, offsets = [], [], []
     for item in message.fields:
@@ -44,28 +62,42 @@ def cloud_dtype(message: Any, where: str) -> np.dtype:
         names.append(item.name)
         formats.append(order + DATATYPES[item.datatype])
         offsets.append(int(item.offset))
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    return np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': step})
 
 
 def _check_size(message: Any, where: str) -> None:
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     if height * width == 0:
-        raise ConvertError("empty", f"{where}: the cloud is empty (height {height}, width {width})")
+        raise ConvertError(
+            'empty', f'{where}: the cloud is empty (height {height}, width {width})'
+        )
     if step == 0 or int(message.row_step) < step * width:
-        raise ConvertError("size", f"{where}: row_step {message.row_step} must be at least width x point_step = "
-                           f"{width} x {step}, and point_step greater than 0")
+        raise ConvertError(
+            'size',
+            f'{where}: row_step {message.row_step} must be at least width x point_step = '
+            f'{width} x {step}, and point_step greater than 0',
+        )
     if len(message.data) != height * int(message.row_step):
-        raise ConvertError("size", f"{where}: data holds {len(message.data)} bytes; height x row_step = "
-                           f"{height} x {message.row_step} asks for {height * int(message.row_step)}")
+        raise ConvertError(
+            'size',
+            f'{where}: data holds {len(message.data)} bytes; height x row_step = '
+            f'{height} x {message.row_step} asks for {height * int(message.row_step)}',
+        )
 
 
 def _check_field(item: Any, step: int, taken: list[str], where: str) -> None:
     if item.datatype not in DATATYPES:
-        raise ConvertError("type", f"{where}: field '{item.name}' has datatype {item.datatype}; valid: 1 to 8")
+        raise ConvertError(
+            'type', f"{where}: field '{item.name}' has datatype {item.datatype}; valid: 1 to 8"
+        )
     if item.name in taken:
-        raise ConvertError("fields", f"{where}: field '{item.name}' appears twice")
+        raise ConvertError('fields', f"{where}: field '{item.name}' appears twice")
     if item.count not in (0, 1):  # 0 is what some drivers write for a scalar
-        raise ConvertError("fields", f"{where}: field '{item.name}' has count {item.count}; one value is expected")
+        raise ConvertError(
+            'fields', f"{where}: field '{item.name}' has count {item.count}; one value is expected"
+        )
     if item.offset + np.dtype(DATATYPES[item.datatype]).itemsize > step:
-        raise ConvertError("fields", f"{where}: field '{item.name}' at offset {item.offset} ends beyond "
-                           f"point_step {step}")
+        raise ConvertError(
+            'fields',
+            f"{where}: field '{item.name}' at offset {item.offset} ends beyond point_step {step}",
+        )

@@ -1,10 +1,11 @@
-"""ROS messages <-> `continuum_loc.measurements`, both ways.
+"""
+ROS messages <-> `continuum_loc.measurements`, both ways.
 
-Works on rclpy's messages and on rosbags' alike: reading goes by attribute, and building is handed a
-`msg_tools.factory.Messages`. Which topic carries what is in `msg_tools.topics`.
+Works on rclpy's messages and on rosbags' alike: reading goes by attribute, and building is handed
+a `msg_tools.factory.Messages`. Which topic carries what is in `msg_tools.topics`.
 
-A pose covariance of ROS is about the axes of the header's frame (REP-103), ours about the body's own:
-with R the body's rotation, C_ros = diag(R, R) C diag(R, R)^T to first order.
+A pose covariance of ROS is about the axes of the header's frame (REP-103), ours about the body's
+own: with R the body's rotation, C_ros = diag(R, R) C diag(R, R)^T to first order.
 """
 
 from __future__ import annotations
@@ -12,79 +13,92 @@ from __future__ import annotations
 from math import isqrt
 from typing import Any
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from continuum_loc.measurements import (
-    NANOSECONDS,
-    TOF_NO_TARGET,
-    TOF_VALID,
     EncoderSample,
     FieldSample,
     ImuSample,
+    NANOSECONDS,
+    nanoseconds,
     StrainSample,
+    TOF_NO_TARGET,
+    TOF_VALID,
     TofFrame,
     TrackedPose,
     TruthSample,
-    nanoseconds,
 )
 from msg_tools.clouds import cloud_array, cloud_message
 from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord, TipRecord
+import numpy as np
+from scipy.spatial.transform import Rotation
 
-MAP = "map"
+MAP = 'map'
 
 # Aligned to 4 bytes, so that viewers which cast the buffer are served too.
-TOF_DTYPE = np.dtype({
-    "names": ["x", "y", "z", "range", "sigma", "status"],
-    "formats": ["<f4"] * 5 + ["u1"],
-    "offsets": [0, 4, 8, 12, 16, 20],
-    "itemsize": 24,
-})
-_STRAIN_LABELS = ("station", "s,theta,kappa")
+TOF_DTYPE = np.dtype(
+    {
+        'names': ['x', 'y', 'z', 'range', 'sigma', 'status'],
+        'formats': ['<f4'] * 5 + ['u1'],
+        'offsets': [0, 4, 8, 12, 16, 20],
+        'itemsize': 24,
+    }
+)
+_STRAIN_LABELS = ('station', 's,theta,kappa')
 
 # ---------------------------------------------------------------- headers, stamps, poses
 
 
 def time_message(make: Messages, stamp: int) -> Any:
     """builtin_interfaces/Time of integer nanoseconds."""
-    return make("builtin_interfaces/msg/Time", sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
+    return make(
+        'builtin_interfaces/msg/Time', sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS
+    )
 
 
 def header_message(make: Messages, stamp: int, frame_id: str) -> Any:
     """std_msgs/Header."""
-    return make("std_msgs/msg/Header", stamp=time_message(make, stamp), frame_id=frame_id)
+    return make('std_msgs/msg/Header', stamp=time_message(make, stamp), frame_id=frame_id)
 
 
 def stamp_of(header: Any, where: str) -> int:
     """Integer nanoseconds of a header. Raises ConvertError where the fields are out of range."""
     sec, nanosec = int(header.stamp.sec), int(header.stamp.nanosec)
     if sec < 0 or not 0 <= nanosec < NANOSECONDS:
-        raise ConvertError("stamp", f"{where}: stamp {sec} s {nanosec} ns is not a time; valid: sec >= 0, "
-                           "0 <= nanosec < 1000000000")
+        raise ConvertError(
+            'stamp',
+            f'{where}: stamp {sec} s {nanosec} ns is not a time; valid: sec >= 0, '
+            '0 <= nanosec < 1000000000',
+        )
     return sec * NANOSECONDS + nanosec
 
 
 def frame_of(header: Any, where: str) -> str:
     """The header's frame without a leading slash (tf1's habit). Raises ConvertError where it is empty."""
-    frame = header.frame_id.lstrip("/")
+    frame = header.frame_id.lstrip('/')
     if not frame:
-        raise ConvertError("frame", f"{where}: header.frame_id is empty; it must name the sensor")
+        raise ConvertError('frame', f'{where}: header.frame_id is empty; it must name the sensor')
     return frame
 
 
 def _require_map(header: Any, where: str) -> None:
-    if header.frame_id.lstrip("/") != MAP:
-        raise ConvertError("frame", f"{where}: header.frame_id is '{header.frame_id}'; valid: '{MAP}'")
+    if header.frame_id.lstrip('/') != MAP:
+        raise ConvertError(
+            'frame', f"{where}: header.frame_id is '{header.frame_id}'; valid: '{MAP}'"
+        )
 
 
 def pose_message(make: Messages, T: np.ndarray, quaternion: np.ndarray | None = None) -> Any:
     """geometry_msgs/Pose of a (4, 4) transform; pass the quaternion (x, y, z, w) where it is known already."""
-    x, y, z, w = (Rotation.from_matrix(T[:3, :3]).as_quat() if quaternion is None else quaternion).tolist()
+    x, y, z, w = (
+        Rotation.from_matrix(T[:3, :3]).as_quat() if quaternion is None else quaternion
+    ).tolist()
     px, py, pz = T[:3, 3].tolist()
-    return make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", x=px, y=py, z=pz),
-                orientation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w))
+    return make(
+        'geometry_msgs/msg/Pose',
+        position=make('geometry_msgs/msg/Point', x=px, y=py, z=pz),
+        orientation=make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+    )
 
 
 def pose_messages(make: Messages, T: np.ndarray) -> list:
@@ -95,13 +109,29 @@ def pose_messages(make: Messages, T: np.ndarray) -> list:
 
 def transforms_of(poses: list, where: str) -> np.ndarray:
     """(N, 4, 4) of geometry_msgs/Pose. Raises ConvertError on what is not a pose."""
-    values = np.array([(p.position.x, p.position.y, p.position.z, p.orientation.x, p.orientation.y,
-                        p.orientation.z, p.orientation.w) for p in poses], float).reshape(-1, 7)
-    _require_finite(values, "pose", where)
+    values = np.array(
+        [
+            (
+                p.position.x,
+                p.position.y,
+                p.position.z,
+                p.orientation.x,
+                p.orientation.y,
+                p.orientation.z,
+                p.orientation.w,
+            )
+            for p in poses
+        ],
+        float,
+    ).reshape(-1, 7)
+    _require_finite(values, 'pose', where)
     norms = np.linalg.norm(values[:, 3:], axis=1)
     if (np.abs(norms - 1.0) > 1e-2).any():
-        raise ConvertError("value", f"{where}: a quaternion has norm {norms[np.argmax(np.abs(norms - 1))]:.3g}; "
-                           "valid: 1 within 0.01")
+        raise ConvertError(
+            'value',
+            f'{where}: a quaternion has norm {norms[np.argmax(np.abs(norms - 1))]:.3g}; '
+            'valid: 1 within 0.01',
+        )
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix() if len(poses) else T[:, :3, :3]
     T[:, :3, 3] = values[:, :3]
@@ -117,9 +147,9 @@ def ros_covariance(covariance: np.ndarray, R: np.ndarray) -> np.ndarray:
 def body_covariance(covariance: Any, R: np.ndarray, where: str) -> np.ndarray:
     """(6, 6) covariance about the body's axes, of 36 numbers about the map's."""
     values = np.asarray(covariance, float).reshape(6, 6)
-    _require_finite(values, "covariance", where)
+    _require_finite(values, 'covariance', where)
     if (np.diag(values) < 0.0).any():
-        raise ConvertError("value", f"{where}: the covariance has a negative variance")
+        raise ConvertError('value', f'{where}: the covariance has a negative variance')
     turn = np.kron(np.eye(2), R)
     return turn.T @ values @ turn
 
@@ -130,12 +160,14 @@ def _vector(item: Any) -> np.ndarray:
 
 def _vector_message(make: Messages, value: np.ndarray) -> Any:
     x, y, z = value.tolist()
-    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+    return make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
 
 
 def _require_finite(values: np.ndarray, what: str, where: str) -> None:
     if not np.isfinite(values).all():
-        raise ConvertError("value", f"{where}: {what} holds a value that is not finite: {np.ravel(values)[:8]}")
+        raise ConvertError(
+            'value', f'{where}: {what} holds a value that is not finite: {np.ravel(values)[:8]}'
+        )
 
 
 # ---------------------------------------------------------------- tof/points
@@ -145,52 +177,81 @@ def tof_message(make: Messages, frame: TofFrame) -> Any:
     """PointCloud2 of a ToF frame; a square number of zones is organised as rows x columns."""
     side = isqrt(len(frame.ranges))
     shape = (side, side) if side * side == len(frame.ranges) else (1, len(frame.ranges))
-    array = np.zeros(len(frame.ranges), TOF_DTYPE)  # zeroed: the padding bytes must not vary between runs
-    array["x"], array["y"], array["z"] = frame.points.T
-    array["range"], array["sigma"], array["status"] = frame.ranges, frame.sigma, frame.status
-    return cloud_message(make, header_message(make, frame.stamp, frame.sensor), array.reshape(shape))
+    array = np.zeros(
+        len(frame.ranges), TOF_DTYPE
+    )  # zeroed: the padding bytes must not vary between runs
+    array['x'], array['y'], array['z'] = frame.points.T
+    array['range'], array['sigma'], array['status'] = frame.ranges, frame.sigma, frame.status
+    return cloud_message(
+        make, header_message(make, frame.stamp, frame.sensor), array.reshape(shape)
+    )
 
 
-def tof_frame(message: Any, where: str = "tof/points") -> TofFrame:
-    """The ToF frame of a PointCloud2 with at least x, y, z.
+def tof_frame(message: Any, where: str = 'tof/points') -> TofFrame:
+    """
+    The ToF frame of a PointCloud2 with at least x, y, z.
 
-    Absent fields are filled: `range` from the points (nan where there is none), `sigma` with nan, `status` with
-    5 where a range is finite and 255 elsewhere. Raises ConvertError on another layout, or where the stated
-    range is not the distance of the point (a driver that put the perpendicular distance there).
+    Absent fields are filled: `range` from the points (nan where there is none), `sigma` with nan,
+    `status` with 5 where a range is finite and 255 elsewhere. Raises ConvertError on another
+    layout, or where the stated range is not the distance of the point (a driver that put the
+    perpendicular distance there).
     """
     array = cloud_array(message, where).reshape(-1)
-    missing = [name for name in "xyz" if name not in array.dtype.names]
+    missing = [name for name in 'xyz' if name not in array.dtype.names]
     if missing:
-        raise ConvertError("fields", f"{where}: no field {', '.join(missing)}; needed: x, y, z, and if known range, "
-                           f"sigma, status; got: {', '.join(array.dtype.names) or 'none'}")
-    points = np.column_stack([array[name] for name in "xyz"]).astype(float)
+        raise ConvertError(
+            'fields',
+            f'{where}: no field {", ".join(missing)}; needed: x, y, z, and if known range, '
+            f'sigma, status; got: {", ".join(array.dtype.names) or "none"}',
+        )
+    points = np.column_stack([array[name] for name in 'xyz']).astype(float)
     ranges = _tof_ranges(array, points, where)
     finite = np.isfinite(ranges)
-    sigma = array["sigma"].astype(float) if "sigma" in array.dtype.names else np.full(len(array), np.nan)
-    status = array["status"] if "status" in array.dtype.names else np.where(finite, TOF_VALID, TOF_NO_TARGET)
-    return TofFrame(stamp=stamp_of(message.header, where), sensor=frame_of(message.header, where), points=points,
-                    ranges=ranges, sigma=sigma, status=_octets(status, where))
+    sigma = (
+        array['sigma'].astype(float)
+        if 'sigma' in array.dtype.names
+        else np.full(len(array), np.nan)
+    )
+    status = (
+        array['status']
+        if 'status' in array.dtype.names
+        else np.where(finite, TOF_VALID, TOF_NO_TARGET)
+    )
+    return TofFrame(
+        stamp=stamp_of(message.header, where),
+        sensor=frame_of(message.header, where),
+        points=points,
+        ranges=ranges,
+        sigma=sigma,
+        status=_octets(status, where),
+    )
 
 
 def _tof_ranges(array: np.ndarray, points: np.ndarray, where: str) -> np.ndarray:
-    distance = np.sqrt(np.einsum("ij,ij->i", points, points))
-    if "range" not in array.dtype.names:
+    distance = np.sqrt(np.einsum('ij,ij->i', points, points))
+    if 'range' not in array.dtype.names:
         return np.where(np.isfinite(distance), distance, np.nan)
-    ranges = array["range"].astype(float)
+    ranges = array['range'].astype(float)
     finite = np.isfinite(ranges)
     apart = finite & ~(np.abs(distance - ranges) <= 0.01 + 0.01 * np.abs(ranges))
     if apart.any():
         zone = int(np.argmax(apart))
-        raise ConvertError("range", f"{where}: in {apart.sum()} of {len(ranges)} zones `range` is not the point's "
-                           f"distance (zone {zone}: range {ranges[zone]:.3f} m, point at {distance[zone]:.3f} m)")
+        raise ConvertError(
+            'range',
+            f"{where}: in {apart.sum()} of {len(ranges)} zones `range` is not the point's "
+            f'distance (zone {zone}: range {ranges[zone]:.3f} m, point at {distance[zone]:.3f} m)',
+        )
     return ranges
 
 
 def _octets(status: np.ndarray, where: str) -> np.ndarray:
-    if status.dtype.kind == "f" and not np.isfinite(status).all():
-        raise ConvertError("value", f"{where}: field 'status' holds a value that is not finite")
+    if status.dtype.kind == 'f' and not np.isfinite(status).all():
+        raise ConvertError('value', f"{where}: field 'status' holds a value that is not finite")
     if ((status < 0) | (status > 255)).any():
-        raise ConvertError("value", f"{where}: field 'status' holds {status.min()} to {status.max()}; valid: 0 to 255")
+        raise ConvertError(
+            'value',
+            f"{where}: field 'status' holds {status.min()} to {status.max()}; valid: 0 to 255",
+        )
     return status.astype(np.uint8)
 
 
@@ -202,39 +263,53 @@ def imu_message(make: Messages, sample: ImuSample) -> Any:
     absent = np.zeros(9)
     absent[0] = -1.0
     gyro_alone = np.isnan(sample.linear_acceleration).all()
-    return make("sensor_msgs/msg/Imu", header=header_message(make, sample.stamp, sample.sensor),
-                orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-                orientation_covariance=absent,
-                angular_velocity=_vector_message(make, sample.angular_velocity),
-                angular_velocity_covariance=np.zeros(9),
-                linear_acceleration=_vector_message(make, np.zeros(3) if gyro_alone else sample.linear_acceleration),
-                linear_acceleration_covariance=absent if gyro_alone else np.zeros(9))
+    return make(
+        'sensor_msgs/msg/Imu',
+        header=header_message(make, sample.stamp, sample.sensor),
+        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=absent,
+        angular_velocity=_vector_message(make, sample.angular_velocity),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=_vector_message(
+            make, np.zeros(3) if gyro_alone else sample.linear_acceleration
+        ),
+        linear_acceleration_covariance=absent if gyro_alone else np.zeros(9),
+    )
 
 
-def imu_sample(message: Any, where: str = "imu/data_raw") -> ImuSample:
+def imu_sample(message: Any, where: str = 'imu/data_raw') -> ImuSample:
     """The IMU sample of an Imu message; a gyro alone (linear_acceleration_covariance[0] = -1) has nan acceleration."""
     if message.angular_velocity_covariance[0] == -1.0:
-        raise ConvertError("value", f"{where}: angular_velocity_covariance[0] = -1 says that there is no gyro")
+        raise ConvertError(
+            'value', f'{where}: angular_velocity_covariance[0] = -1 says that there is no gyro'
+        )
     rate, force = _vector(message.angular_velocity), _vector(message.linear_acceleration)
-    _require_finite(rate, "angular_velocity", where)
+    _require_finite(rate, 'angular_velocity', where)
     if message.linear_acceleration_covariance[0] == -1.0:
         force = np.full(3, np.nan)
     else:
-        _require_finite(force, "linear_acceleration", where)
+        _require_finite(force, 'linear_acceleration', where)
     return ImuSample(stamp_of(message.header, where), frame_of(message.header, where), rate, force)
 
 
 def field_message(make: Messages, sample: FieldSample) -> Any:
     """MagneticField; nan where an axis is saturated."""
-    return make("sensor_msgs/msg/MagneticField", header=header_message(make, sample.stamp, sample.sensor),
-                magnetic_field=_vector_message(make, sample.field), magnetic_field_covariance=np.zeros(9))
+    return make(
+        'sensor_msgs/msg/MagneticField',
+        header=header_message(make, sample.stamp, sample.sensor),
+        magnetic_field=_vector_message(make, sample.field),
+        magnetic_field_covariance=np.zeros(9),
+    )
 
 
-def field_sample(message: Any, where: str = "imu/mag") -> FieldSample:
+def field_sample(message: Any, where: str = 'imu/mag') -> FieldSample:
     """The Hall sample of a MagneticField message."""
     value = _vector(message.magnetic_field)
     if np.isinf(value).any():
-        raise ConvertError("value", f"{where}: magnetic_field {value} is infinite; valid: tesla, nan where saturated")
+        raise ConvertError(
+            'value',
+            f'{where}: magnetic_field {value} is infinite; valid: tesla, nan where saturated',
+        )
     return FieldSample(stamp_of(message.header, where), frame_of(message.header, where), value)
 
 
@@ -246,10 +321,12 @@ def strain_message(make: Messages, sample: StrainSample) -> Any:
     rows = np.column_stack([sample.s, sample.theta, sample.kappa])
     data = np.concatenate([[sample.stamp / NANOSECONDS], rows.reshape(-1)])
     sizes = ((len(rows), rows.size), (3, 3))
-    dim = [make("std_msgs/msg/MultiArrayDimension", label=label, size=size, stride=stride)
-           for label, (size, stride) in zip(_STRAIN_LABELS, sizes, strict=True)]
-    layout = make("std_msgs/msg/MultiArrayLayout", dim=dim, data_offset=1)
-    return make("std_msgs/msg/Float64MultiArray", layout=layout, data=make.doubles(data))
+    dim = [
+        make('std_msgs/msg/MultiArrayDimension', label=label, size=size, stride=stride)
+        for label, (size, stride) in zip(_STRAIN_LABELS, sizes, strict=True)
+    ]
+    layout = make('std_msgs/msg/MultiArrayLayout', dim=dim, data_offset=1)
+    return make('std_msgs/msg/Float64MultiArray', layout=layout, data=make.doubles(data))
 
 
 def strain_is_stamped(message: Any) -> bool:
@@ -257,31 +334,46 @@ def strain_is_stamped(message: Any) -> bool:
     return message.layout.data_offset == 1
 
 
-def strain_sample(message: Any, arrival: int | None = None, where: str = "strain") -> StrainSample:
+def strain_sample(message: Any, arrival: int | None = None, where: str = 'strain') -> StrainSample:
     """The strain of a Float64MultiArray; `arrival` (ns) is the stamp of one with data_offset = 0."""
     data = np.array(message.data, float)
     offset = int(message.layout.data_offset)
     if offset not in (0, 1):
-        raise ConvertError("size", f"{where}: layout.data_offset is {offset}; valid: 1 (data[0] is the stamp) or 0")
+        raise ConvertError(
+            'size',
+            f'{where}: layout.data_offset is {offset}; valid: 1 (data[0] is the stamp) or 0',
+        )
     labels = tuple(dim.label for dim in message.layout.dim)
     if labels and labels != _STRAIN_LABELS:
-        raise ConvertError("fields", f"{where}: layout.dim is labelled {labels}; valid: {_STRAIN_LABELS}")
+        raise ConvertError(
+            'fields', f'{where}: layout.dim is labelled {labels}; valid: {_STRAIN_LABELS}'
+        )
     rows = data[offset:]
     if len(rows) == 0 or len(rows) % 3 or (labels and message.layout.dim[0].size * 3 != len(rows)):
-        raise ConvertError("size", f"{where}: {len(rows)} values after the offset; valid: 3 (s, theta, kappa) for each "
-                           f"of the {message.layout.dim[0].size if labels else 'M'} stations, at least one")
-    _require_finite(data, "data", where)
+        raise ConvertError(
+            'size',
+            f'{where}: {len(rows)} values after the offset; valid: 3 (s, theta, kappa) for each '
+            f'of the {message.layout.dim[0].size if labels else "M"} stations, at least one',
+        )
+    _require_finite(data, 'data', where)
     s, theta, kappa = rows.reshape(-1, 3).T
-    return StrainSample(_strain_stamp(data, offset, arrival, where), s.copy(), theta.copy(), kappa.copy())
+    return StrainSample(
+        _strain_stamp(data, offset, arrival, where), s.copy(), theta.copy(), kappa.copy()
+    )
 
 
 def _strain_stamp(data: np.ndarray, offset: int, arrival: int | None, where: str) -> int:
     if offset == 0:
         if arrival is None:
-            raise ConvertError("stamp", f"{where}: data_offset = 0 states no stamp, and no arrival time is known")
+            raise ConvertError(
+                'stamp', f'{where}: data_offset = 0 states no stamp, and no arrival time is known'
+            )
         return arrival
     if not 0.0 <= data[0] < 2.0**33:
-        raise ConvertError("stamp", f"{where}: data[0] = {data[0]:.6g} is not a stamp in seconds; valid: 0 to 2^33")
+        raise ConvertError(
+            'stamp',
+            f'{where}: data[0] = {data[0]:.6g} is not a stamp in seconds; valid: 0 to 2^33',
+        )
     return nanoseconds(data[0])
 
 
@@ -291,12 +383,18 @@ def _strain_stamp(data: np.ndarray, offset: int, arrival: int | None, where: str
 def tracker_message(make: Messages, pose: TrackedPose) -> Any:
     """PoseWithCovarianceStamped in `map`; the topic names the sensor."""
     covariance = ros_covariance(pose.covariance, pose.T_map_sensor[:3, :3])
-    return make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header_message(make, pose.stamp, MAP),
-                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose_message(make, pose.T_map_sensor),
-                          covariance=covariance))
+    return make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        header=header_message(make, pose.stamp, MAP),
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(make, pose.T_map_sensor),
+            covariance=covariance,
+        ),
+    )
 
 
-def tracked_pose(message: Any, sensor: str, where: str = "tracker") -> TrackedPose:
+def tracked_pose(message: Any, sensor: str, where: str = 'tracker') -> TrackedPose:
     """The pose of `sensor`, from PoseWithCovarianceStamped in `map`."""
     _require_map(message.header, where)
     T = transforms_of([message.pose.pose], where)[0]
@@ -306,49 +404,60 @@ def tracked_pose(message: Any, sensor: str, where: str = "tracker") -> TrackedPo
 
 def encoder_message(make: Messages, sample: EncoderSample) -> Any:
     """JointState with positions and efforts."""
-    return make("sensor_msgs/msg/JointState", header=header_message(make, sample.stamp, ""),
-                name=list(sample.names), position=make.doubles(np.asarray(sample.position, float)),
-                velocity=make.doubles(np.empty(0)), effort=make.doubles(np.asarray(sample.effort, float)))
+    return make(
+        'sensor_msgs/msg/JointState',
+        header=header_message(make, sample.stamp, ''),
+        name=list(sample.names),
+        position=make.doubles(np.asarray(sample.position, float)),
+        velocity=make.doubles(np.empty(0)),
+        effort=make.doubles(np.asarray(sample.effort, float)),
+    )
 
 
-def encoder_sample(message: Any, where: str = "joint_states") -> EncoderSample:
+def encoder_sample(message: Any, where: str = 'joint_states') -> EncoderSample:
     """The encoders of a JointState; an empty `position` or `effort` becomes nan."""
     names = tuple(message.name)
     if not names:
-        raise ConvertError("empty", f"{where}: no joint is named")
+        raise ConvertError('empty', f'{where}: no joint is named')
     if len(set(names)) != len(names):
-        raise ConvertError("fields", f"{where}: a joint is named twice: {', '.join(names)}")
-    position = _per_joint(message.position, names, "position", where)
-    effort = _per_joint(message.effort, names, "effort", where)
+        raise ConvertError('fields', f'{where}: a joint is named twice: {", ".join(names)}')
+    position = _per_joint(message.position, names, 'position', where)
+    effort = _per_joint(message.effort, names, 'effort', where)
     return EncoderSample(stamp_of(message.header, where), names, position, effort)
 
 
 def _per_joint(values: Any, names: tuple[str, ...], what: str, where: str) -> np.ndarray:
     array = np.array(values, float)
     if len(array) not in (0, len(names)):
-        raise ConvertError("size", f"{where}: {len(array)} values of {what} for {len(names)} joints; valid: as many "
-                           "as names, or none")
+        raise ConvertError(
+            'size',
+            f'{where}: {len(array)} values of {what} for {len(names)} joints; valid: as many '
+            'as names, or none',
+        )
     if np.isinf(array).any():
-        raise ConvertError("value", f"{where}: {what} holds an infinite value")
+        raise ConvertError('value', f'{where}: {what} holds an infinite value')
     return array if len(array) else np.full(len(names), np.nan)
 
 
-# ---------------------------------------------------------------- poses, paths, tip, clouds, diagnostics
+# ---------------------------------------------------------- poses, paths, tip, clouds, diagnostics
 
 
 def poses_message(make: Messages, stamp: int, T_map_body: np.ndarray) -> Any:
     """PoseArray in `map` of (N, 4, 4)."""
-    return make("geometry_msgs/msg/PoseArray", header=header_message(make, stamp, MAP),
-                poses=pose_messages(make, T_map_body))
+    return make(
+        'geometry_msgs/msg/PoseArray',
+        header=header_message(make, stamp, MAP),
+        poses=pose_messages(make, T_map_body),
+    )
 
 
-def poses_record(message: Any, where: str = "poses") -> PosesRecord:
+def poses_record(message: Any, where: str = 'poses') -> PosesRecord:
     """The poses of a PoseArray in `map`."""
     _require_map(message.header, where)
     return PosesRecord(stamp_of(message.header, where), transforms_of(message.poses, where))
 
 
-def truth_sample(message: Any, where: str = "ground_truth/poses") -> TruthSample:
+def truth_sample(message: Any, where: str = 'ground_truth/poses') -> TruthSample:
     """The true ring poses of a PoseArray in `map`."""
     record = poses_record(message, where)
     return TruthSample(record.stamp, record.T_map_body)
@@ -357,12 +466,14 @@ def truth_sample(message: Any, where: str = "ground_truth/poses") -> TruthSample
 def path_message(make: Messages, stamp: int, T_map_backbone: np.ndarray) -> Any:
     """Path in `map` of (B, 4, 4)."""
     header = header_message(make, stamp, MAP)
-    poses = [make("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
-             for pose in pose_messages(make, T_map_backbone)]
-    return make("nav_msgs/msg/Path", header=header, poses=poses)
+    poses = [
+        make('geometry_msgs/msg/PoseStamped', header=header, pose=pose)
+        for pose in pose_messages(make, T_map_backbone)
+    ]
+    return make('nav_msgs/msg/Path', header=header, poses=poses)
 
 
-def path_record(message: Any, where: str = "backbone") -> PathRecord:
+def path_record(message: Any, where: str = 'backbone') -> PathRecord:
     """The transforms of a Path in `map`."""
     _require_map(message.header, where)
     T = transforms_of([item.pose for item in message.poses], where)
@@ -372,35 +483,55 @@ def path_record(message: Any, where: str = "backbone") -> PathRecord:
 def tip_message(make: Messages, tip: TipRecord, child_frame: str) -> Any:
     """Odometry: pose and its covariance in `map`, twist and its covariance in the tip's own frame (REP-103)."""
     covariance = ros_covariance(tip.covariance, tip.T_map_tip[:3, :3])
-    twist = make("geometry_msgs/msg/Twist", linear=_vector_message(make, tip.velocity[:3]),
-                 angular=_vector_message(make, tip.velocity[3:]))
-    return make("nav_msgs/msg/Odometry", header=header_message(make, tip.stamp, MAP), child_frame_id=child_frame,
-                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose_message(make, tip.T_map_tip),
-                          covariance=covariance),
-                twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist,
-                           covariance=np.ascontiguousarray(tip.velocity_covariance, float).reshape(36)))
+    twist = make(
+        'geometry_msgs/msg/Twist',
+        linear=_vector_message(make, tip.velocity[:3]),
+        angular=_vector_message(make, tip.velocity[3:]),
+    )
+    return make(
+        'nav_msgs/msg/Odometry',
+        header=header_message(make, tip.stamp, MAP),
+        child_frame_id=child_frame,
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(make, tip.T_map_tip),
+            covariance=covariance,
+        ),
+        twist=make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=twist,
+            covariance=np.ascontiguousarray(tip.velocity_covariance, float).reshape(36),
+        ),
+    )
 
 
-def tip_record(message: Any, where: str = "tip") -> TipRecord:
+def tip_record(message: Any, where: str = 'tip') -> TipRecord:
     """The tip of an Odometry message in `map`."""
     _require_map(message.header, where)
     T = transforms_of([message.pose.pose], where)[0]
-    velocity = np.concatenate([_vector(message.twist.twist.linear), _vector(message.twist.twist.angular)])
+    velocity = np.concatenate(
+        [_vector(message.twist.twist.linear), _vector(message.twist.twist.angular)]
+    )
     velocity_covariance = np.array(message.twist.covariance, float).reshape(6, 6)
-    return TipRecord(stamp_of(message.header, where), T, body_covariance(message.pose.covariance, T[:3, :3], where),
-                     velocity, velocity_covariance)
+    return TipRecord(
+        stamp_of(message.header, where),
+        T,
+        body_covariance(message.pose.covariance, T[:3, :3], where),
+        velocity,
+        velocity_covariance,
+    )
 
 
 def columns_message(make: Messages, cloud: CloudRecord, frame_id: str = MAP) -> Any:
     """PointCloud2 of named columns, float32."""
     names = list(cloud.fields)
-    array = np.zeros(len(cloud.fields["x"]), np.dtype([(name, "<f4") for name in names]))
+    array = np.zeros(len(cloud.fields['x']), np.dtype([(name, '<f4') for name in names]))
     for name in names:
         array[name] = cloud.fields[name]
     return cloud_message(make, header_message(make, cloud.stamp, frame_id), array)
 
 
-def cloud_record(message: Any, where: str = "cloud") -> CloudRecord:
+def cloud_record(message: Any, where: str = 'cloud') -> CloudRecord:
     """All columns of a PointCloud2 in `map`; it may be empty."""
     _require_map(message.header, where)
     stamp = stamp_of(message.header, where)
@@ -413,7 +544,7 @@ def cloud_record(message: Any, where: str = "cloud") -> CloudRecord:
 def map_record(stamp: int, prior_map: Any) -> CloudRecord:
     """The columns of `prior_map`: points, normals and planarity of a PriorMap."""
     values = np.column_stack([prior_map.points, prior_map.normals, prior_map.planarity])
-    names = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "planarity")
+    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z', 'planarity')
     return CloudRecord(stamp, dict(zip(names, values.T, strict=True)))
 
 
@@ -421,20 +552,42 @@ def diagnostics_message(make: Messages, record: DiagnosticsRecord) -> Any:
     """DiagnosticArray."""
     statuses = []
     for name, level, text, values in record.statuses:
-        pairs = [make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
-        statuses.append(make("diagnostic_msgs/msg/DiagnosticStatus", level=_level(make, level), name=name,
-                             message=text, hardware_id="", values=pairs))
-    return make("diagnostic_msgs/msg/DiagnosticArray", header=header_message(make, record.stamp, ""), status=statuses)
+        pairs = [
+            make('diagnostic_msgs/msg/KeyValue', key=key, value=value)
+            for key, value in values.items()
+        ]
+        statuses.append(
+            make(
+                'diagnostic_msgs/msg/DiagnosticStatus',
+                level=_level(make, level),
+                name=name,
+                message=text,
+                hardware_id='',
+                values=pairs,
+            )
+        )
+    return make(
+        'diagnostic_msgs/msg/DiagnosticArray',
+        header=header_message(make, record.stamp, ''),
+        status=statuses,
+    )
 
 
 def _level(make: Messages, level: int) -> Any:
-    """rclpy wants `byte` as bytes, rosbags as int: the constant of the class tells which."""
-    ok = make.resolve("diagnostic_msgs/msg/DiagnosticStatus").OK
+    """Rclpy wants `byte` as bytes, rosbags as int: the constant of the class tells which."""
+    ok = make.resolve('diagnostic_msgs/msg/DiagnosticStatus').OK
     return bytes([level]) if isinstance(ok, bytes) else level
 
 
-def diagnostics_record(message: Any, where: str = "/diagnostics") -> DiagnosticsRecord:
+def diagnostics_record(message: Any, where: str = '/diagnostics') -> DiagnosticsRecord:
     """The statuses of a DiagnosticArray."""
-    statuses = tuple((item.name, item.level[0] if isinstance(item.level, bytes) else int(item.level), item.message,
-                      {pair.key: pair.value for pair in item.values}) for item in message.status)
+    statuses = tuple(
+        (
+            item.name,
+            item.level[0] if isinstance(item.level, bytes) else int(item.level),
+            item.message,
+            {pair.key: pair.value for pair in item.values},
+        )
+        for item in message.status
+    )
     return DiagnosticsRecord(stamp_of(message.header, where), statuses)

@@ -2,9 +2,11 @@
 
 
 class ConvertError(ValueError):
-    """A message that cannot be used. The text says what, where and what is valid.
+    """
+    A message that cannot be used. The text says what, where and what is valid.
 
-    kind: short name of the class of error (`size`, `type`, `stamp`, `frame`, ...), under which nodes count it.
+    kind: short name of the class of error (`size`, `type`, `stamp`, `frame`, ...), under which
+    nodes count it.
     """
 
     def __init__(self, kind: str, text: str) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import array
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+import importlib
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,12 @@ SLACK = 8  # bytes behind a message that are not an error
 
 @dataclass(frozen=True)
 class Messages:
-    """Builds messages of one flavour.
+    """
+    Builds messages of one flavour.
 
     resolve: message class of a full type name such as `sensor_msgs/msg/Imu`.
-    octets, doubles: turn an array into what the flavour wants in a `uint8[]` or a `float64[]` of free length.
+    octets, doubles: turn an array into what the flavour wants in a `uint8[]` or a `float64[]` of
+    free length.
     """
 
     resolve: Callable[[str], type]
@@ -37,17 +39,20 @@ def ros_messages() -> Messages:
 
     @cache
     def resolve(type_name: str) -> type:
-        package, _, name = type_name.split("/")
-        return getattr(importlib.import_module(f"{package}.msg"), name)
+        package, _, name = type_name.split('/')
+        return getattr(importlib.import_module(f'{package}.msg'), name)
 
-    # An array.array is taken over as a block; an ndarray would be copied element by element (up to 3 ms a cloud).
-    return Messages(resolve, lambda a: array.array("B", a.tobytes()), lambda a: array.array("d", a.tobytes()))
+    # An array.array is taken over as a block; an ndarray would be copied element by element (up to
+    # 3 ms a cloud).
+    return Messages(
+        resolve, lambda a: array.array('B', a.tobytes()), lambda a: array.array('d', a.tobytes())
+    )
 
 
 @cache
 def typestore():
     """The type store of ROS 2 Jazzy's messages."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import get_typestore, Stores
 
     return get_typestore(Stores.ROS2_JAZZY)
 
@@ -56,14 +61,19 @@ def typestore():
 def bag_messages() -> Messages:
     """Messages of rosbags' type store, which bags are written from and read into."""
     types = typestore().types
-    return Messages(types.__getitem__, lambda a: np.frombuffer(a.tobytes(), np.uint8), np.ascontiguousarray)
+    return Messages(
+        types.__getitem__, lambda a: np.frombuffer(a.tobytes(), np.uint8), np.ascontiguousarray
+    )
 
 
 def deserialize(data: bytes, type_name: str):
-    """The rosbags message of serialised bytes (CDR with its 4-byte head). Raises rosbags' SerdeError and others.
+    """
+    The rosbags message of serialised bytes (CDR with its 4-byte head). Raises rosbags' SerdeError
+    and others.
 
-    rclpy's `serialize_message` may leave up to 8 bytes behind the message (it returns the estimated length), and bags
-    written with it hold them; rosbags refuses more than 3. So such a tail is cut off here.
+    rclpy's `serialize_message` may leave up to 8 bytes behind the message (it returns the
+    estimated length), and bags written with it hold them; rosbags refuses more than 3. So such a
+    tail is cut off here.
     """
     from rosbags.serde import SerdeError
 

@@ -44,7 +44,7 @@ class CloudRecord:
     @property
     def points(self) -> np.ndarray:
         """(N, 3) positions in `map`."""
-        return np.column_stack([self.fields[name] for name in "xyz"]).astype(float)
+        return np.column_stack([self.fields[name] for name in 'xyz']).astype(float)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,14 +11,16 @@ from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, PosesRecord, TipRecord
 
-TRACKER = "tracker/"
+TRACKER = 'tracker/'
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of the contract.
+    """
+    One topic of the contract.
 
-    type: ROS type name. encode: (make, item) -> message. decode: (message, arrival ns, where) -> item.
+    type: ROS type name. encode: (make, item) -> message. decode: (message, arrival ns, where) ->
+    item.
     latched: the last message is kept for late joiners. depth: messages a queue holds.
     """
 
@@ -47,8 +49,13 @@ def tip_of(estimate: Any) -> TipRecord:
     """The tip of an `Estimate`: its last ring."""
     if isinstance(estimate, TipRecord):
         return estimate
-    return TipRecord(estimate.stamp, estimate.T_map_ring[-1], estimate.covariance[-1], estimate.velocity[-1],
-                     estimate.velocity_covariance[-1])
+    return TipRecord(
+        estimate.stamp,
+        estimate.T_map_ring[-1],
+        estimate.covariance[-1],
+        estimate.velocity[-1],
+        estimate.velocity_covariance[-1],
+    )
 
 
 def _strain(message: Any, arrival: int | None, where: str) -> Any:
@@ -59,40 +66,81 @@ def _tracker(message: Any, arrival: int | None, where: str) -> Any:
     return convert.tracked_pose(message, where.rpartition(TRACKER)[2], where)
 
 
-_POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-# The depth of an input covers 4 s of all its sensors together, so that a slow moment loses nothing.
+_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+# The depth of an input covers 4 s of all its sensors together, so that a slow moment loses
+# nothing.
 TOPICS: dict[str, Topic] = {
-    "tof/points": Topic("sensor_msgs/msg/PointCloud2", convert.tof_message, _read(convert.tof_frame), depth=1024),
-    "imu/data_raw": Topic("sensor_msgs/msg/Imu", convert.imu_message, _read(convert.imu_sample), depth=2048),
-    "imu/mag": Topic("sensor_msgs/msg/MagneticField", convert.field_message, _read(convert.field_sample), depth=1024),
-    "strain": Topic("std_msgs/msg/Float64MultiArray", convert.strain_message, _strain, depth=128),
+    'tof/points': Topic(
+        'sensor_msgs/msg/PointCloud2', convert.tof_message, _read(convert.tof_frame), depth=1024
+    ),
+    'imu/data_raw': Topic(
+        'sensor_msgs/msg/Imu', convert.imu_message, _read(convert.imu_sample), depth=2048
+    ),
+    'imu/mag': Topic(
+        'sensor_msgs/msg/MagneticField',
+        convert.field_message,
+        _read(convert.field_sample),
+        depth=1024,
+    ),
+    'strain': Topic('std_msgs/msg/Float64MultiArray', convert.strain_message, _strain, depth=128),
     TRACKER: Topic(_POSE, convert.tracker_message, _tracker, depth=512),
-    "joint_states": Topic("sensor_msgs/msg/JointState", convert.encoder_message, _read(convert.encoder_sample),
-                          depth=256),
-    "ground_truth/poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.truth_sample), depth=512),
-    "poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.poses_record)),
-    "backbone": Topic("nav_msgs/msg/Path", _path, _read(convert.path_record)),
-    "tip": Topic("nav_msgs/msg/Odometry", lambda make, item: convert.tip_message(make, tip_of(item), "tip"),
-                 _read(convert.tip_record)),
-    "reconstruction": Topic("sensor_msgs/msg/PointCloud2", convert.columns_message, _read(convert.cloud_record)),
-    "prior_map": Topic("sensor_msgs/msg/PointCloud2", convert.columns_message, _read(convert.cloud_record),
-                       latched=True, depth=1),
-    "shape/poses": Topic("geometry_msgs/msg/PoseArray", _poses, _read(convert.poses_record)),
-    "shape/curve": Topic("nav_msgs/msg/Path", _path, _read(convert.path_record)),
-    "/diagnostics": Topic("diagnostic_msgs/msg/DiagnosticArray", convert.diagnostics_message,
-                          _read(convert.diagnostics_record)),
+    'joint_states': Topic(
+        'sensor_msgs/msg/JointState',
+        convert.encoder_message,
+        _read(convert.encoder_sample),
+        depth=256,
+    ),
+    'ground_truth/poses': Topic(
+        'geometry_msgs/msg/PoseArray', _poses, _read(convert.truth_sample), depth=512
+    ),
+    'poses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(convert.poses_record)),
+    'backbone': Topic('nav_msgs/msg/Path', _path, _read(convert.path_record)),
+    'tip': Topic(
+        'nav_msgs/msg/Odometry',
+        lambda make, item: convert.tip_message(make, tip_of(item), 'tip'),
+        _read(convert.tip_record),
+    ),
+    'reconstruction': Topic(
+        'sensor_msgs/msg/PointCloud2', convert.columns_message, _read(convert.cloud_record)
+    ),
+    'prior_map': Topic(
+        'sensor_msgs/msg/PointCloud2',
+        convert.columns_message,
+        _read(convert.cloud_record),
+        latched=True,
+        depth=1,
+    ),
+    'shape/poses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(convert.poses_record)),
+    'shape/curve': Topic('nav_msgs/msg/Path', _path, _read(convert.path_record)),
+    '/diagnostics': Topic(
+        'diagnostic_msgs/msg/DiagnosticArray',
+        convert.diagnostics_message,
+        _read(convert.diagnostics_record),
+    ),
 }
 
-INPUTS = ("tof/points", "imu/data_raw", "imu/mag", "strain", "joint_states")
-OUTPUTS = ("poses", "backbone", "tip", "reconstruction", "prior_map", "shape/poses", "shape/curve", "/diagnostics")
+INPUTS = ('tof/points', 'imu/data_raw', 'imu/mag', 'strain', 'joint_states')
+OUTPUTS = (
+    'poses',
+    'backbone',
+    'tip',
+    'reconstruction',
+    'prior_map',
+    'shape/poses',
+    'shape/curve',
+    '/diagnostics',
+)
 
 
 def topic_spec(name: str) -> Topic:
     """The contract of a relative topic; `tracker/<sensor>` too. Raises ConvertError listing the valid names."""
     key = TRACKER if name.startswith(TRACKER) else name
     if key not in TOPICS or name == TRACKER:
-        raise ConvertError("topic", f"no topic '{name}' in the contract; valid: "
-                           + ", ".join("tracker/<sensor>" if topic == TRACKER else topic for topic in TOPICS))
+        raise ConvertError(
+            'topic',
+            f"no topic '{name}' in the contract; valid: "
+            + ', '.join('tracker/<sensor>' if topic == TRACKER else topic for topic in TOPICS),
+        )
     return TOPICS[key]
 
 
@@ -100,8 +148,16 @@ def cloud_topic_record(item: Any, stamp: int) -> CloudRecord:
     """What `reconstruction` and `prior_map` are written from: a CloudRecord, a PriorMap or a Reconstruction."""
     if isinstance(item, CloudRecord):
         return item
-    if hasattr(item, "normals"):
+    if hasattr(item, 'normals'):
         return convert.map_record(stamp, item)
     x, y, z = item.points.T
-    return CloudRecord(stamp, {"x": x, "y": y, "z": z, "sigma": item.sigma,
-                               "anomaly": getattr(item, "anomaly", 0.0 * x)})
+    return CloudRecord(
+        stamp,
+        {
+            'x': x,
+            'y': y,
+            'z': z,
+            'sigma': item.sigma,
+            'anomaly': getattr(item, 'anomaly', 0.0 * x),
+        },
+    )

@@ -1,10 +1,12 @@
-"""Hypothesis draws the same examples in every run, so that a change and not chance breaks a test; to search anew:
-HYPOTHESIS_PROFILE=explore make test."""
+"""
+Hypothesis draws the same examples in every run, so that a change and not chance breaks a test; to
+search anew: HYPOTHESIS_PROFILE=explore make test.
+"""
 
 import os
 
 from hypothesis import settings
 
-settings.register_profile("same", derandomize=True)
-settings.register_profile("explore")
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+settings.register_profile('same', derandomize=True)
+settings.register_profile('explore')
+settings.load_profile(os.environ.get('HYPOTHESIS_PROFILE', 'same'))

@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import itertools
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed')
 
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-
-from continuum_loc.measurements import EncoderSample, ImuSample, StrainSample, TofFrame, nanoseconds
+from continuum_loc.measurements import (
+    EncoderSample,
+    ImuSample,
+    nanoseconds,
+    StrainSample,
+    TofFrame,
+)
 from continuum_loc.nodes.runtime import output_qos
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.topics import topic_spec
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 60.0  # s; generous: discovery alone may take seconds, and the machine may be busy
@@ -46,7 +51,9 @@ imu: [{name: imu1, ring: ring1}, {name: imu2, ring: ring2}]
 BOX = np.array([[-0.2, -0.3, -0.3], [0.6, 0.3, 0.3]])
 
 
-MATCHED = 0.5  # s: the other side learns of a subscription about when this side learns of the publisher
+MATCHED = (
+    0.5  # s: the other side learns of a subscription about when this side learns of the publisher
+)
 
 
 def fresh_domain() -> int:
@@ -67,22 +74,42 @@ def wait_until(condition, patience: float = PATIENCE, step=lambda: time.sleep(0.
 class Process:
     """A node of the package as a process; `log` is what it wrote."""
 
-    def __init__(self, node: str, domain: int, folder: Path, *arguments: str, **parameters) -> None:
-        self.path = folder / f"{node}_{time.monotonic_ns()}.log"
-        given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                                    "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-        with self.path.open("w") as log:
-            self.popen = subprocess.Popen([sys.executable, "-m", f"continuum_loc.nodes.{node}", "--ros-args",
-                                           *arguments, *given], stdout=log, stderr=subprocess.STDOUT, cwd=folder,
-                                          env=environment)
+    def __init__(
+        self, node: str, domain: int, folder: Path, *arguments: str, **parameters
+    ) -> None:
+        self.path = folder / f'{node}_{time.monotonic_ns()}.log'
+        given = [part for name, value in parameters.items() for part in ('-p', f'{name}:={value}')]
+        environment = os.environ | {
+            'ROS_DOMAIN_ID': str(domain),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'OMP_NUM_THREADS': '1',
+            'PYTHONUNBUFFERED': '1',
+        }
+        with self.path.open('w') as log:
+            self.popen = subprocess.Popen(
+                [
+                    sys.executable,
+                    '-m',
+                    f'continuum_loc.nodes.{node}',
+                    '--ros-args',
+                    *arguments,
+                    *given,
+                ],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=folder,
+                env=environment,
+            )
 
     @property
     def log(self) -> str:
-        return self.path.read_text(errors="replace")
+        return self.path.read_text(errors='replace')
 
     def await_log(self, text: str) -> None:
-        assert wait_until(lambda: text in self.log or self.popen.poll() is not None) and text in self.log, self.log
+        assert (
+            wait_until(lambda: text in self.log or self.popen.poll() is not None)
+            and text in self.log
+        ), self.log
 
     def stop(self, how: int = signal.SIGINT) -> int:
         """Signal the node and wait; its exit code."""
@@ -97,11 +124,13 @@ class Process:
 class Client:
     """A node of the test's own: publishes and hears on one domain."""
 
-    def __init__(self, domain: int, namespace: str = "") -> None:
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    def __init__(self, domain: int, namespace: str = '') -> None:
+        os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
-        self.node = Node("client", context=self.context, namespace=namespace, start_parameter_services=False)
+        self.node = Node(
+            'client', context=self.context, namespace=namespace, start_parameter_services=False
+        )
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.heard: dict[str, list] = {}
@@ -125,37 +154,45 @@ class Client:
         """The decoded items that come on a topic of the contract, as they come."""
         spec = topic_spec(topic)
         items = self.heard.setdefault(topic, [])
-        self.node.create_subscription(ros_messages().resolve(spec.type), topic,
-                                      lambda message: items.append(spec.decode(message, 1, topic)),
-                                      qos or output_qos(spec))
+        self.node.create_subscription(
+            ros_messages().resolve(spec.type),
+            topic,
+            lambda message: items.append(spec.decode(message, 1, topic)),
+            qos or output_qos(spec),
+        )
         return items
 
     def publisher(self, topic: str, qos=None):
         if topic not in self._publishers:
             spec = topic_spec(topic)
-            self._publishers[topic] = self.node.create_publisher(ros_messages().resolve(spec.type), topic,
-                                                                 qos or output_qos(spec))
+            self._publishers[topic] = self.node.create_publisher(
+                ros_messages().resolve(spec.type), topic, qos or output_qos(spec)
+            )
         return self._publishers[topic]
 
     def send(self, topic: str, item) -> None:
         self.publisher(topic).publish(topic_spec(topic).encode(ros_messages(), item))
 
     def await_listeners(self, *topics: str, count: int = 1) -> None:
-        assert self.until(lambda: all(self.publisher(t).get_subscription_count() >= count for t in topics)), \
-            f"nobody listens to {topics}"
+        assert self.until(
+            lambda: all(self.publisher(t).get_subscription_count() >= count for t in topics)
+        ), f'nobody listens to {topics}'
 
     def await_speakers(self) -> None:
-        """Wait until somebody publishes on every topic that this client hears, and knows that it does: what is said
-        before that is lost."""
-        assert self.until(lambda: all(self.node.count_publishers(topic) > 0 for topic in self.heard)), \
-            f"nobody publishes one of {list(self.heard)}"
+        """
+        Wait until somebody publishes on every topic that this client hears, and knows that it
+        does: what is said before that is lost.
+        """
+        assert self.until(
+            lambda: all(self.node.count_publishers(topic) > 0 for topic in self.heard)
+        ), f'nobody publishes one of {list(self.heard)}'
         self.until(lambda: False, MATCHED)
 
     def call(self, kind, name: str, request):
         client = self.node.create_client(kind, name)
-        assert self.until(client.service_is_ready), f"no service {name}"
+        assert self.until(client.service_is_ready), f'no service {name}'
         future = client.call_async(request)
-        assert self.until(future.done), f"service {name} does not answer"
+        assert self.until(future.done), f'service {name} does not answer'
         return future.result()
 
     def now(self) -> int:
@@ -166,23 +203,30 @@ class BoxRobot:
     """Samples of a straight, resting robot in a box, whose distances are known, and so the right estimate."""
 
     def __init__(self, folder: Path) -> None:
-        self.path, self.map = folder / "stub.yaml", folder / "box.csv"
+        self.path, self.map = folder / 'stub.yaml', folder / 'box.csv'
         self.path.write_text(ROBOT)
         self.robot = load_robot(self.path)
         self._write_map()
-        self._rng = np.random.default_rng(0)  # a sensor that repeats itself to the last bit counts as frozen
+        self._rng = np.random.default_rng(
+            0
+        )  # a sensor that repeats itself to the last bit counts as frozen
         self.T_map_ring = np.tile(np.eye(4), (3, 1, 1))
         self.T_map_ring[1:, 0, 3] = self.robot.ring_arclengths
 
     def samples(self, stamp: int):
         """(topic, sample) of every sensor at one instant."""
         for sensor in self.robot.tof:
-            yield "tof/points", self.frame(sensor, stamp)
+            yield 'tof/points', self.frame(sensor, stamp)
         for sensor in self.robot.imu:
-            yield "imu/data_raw", ImuSample(stamp, sensor.name, 1e-3 * self._rng.normal(size=3), np.array([0, 0, 9.81]))
+            yield (
+                'imu/data_raw',
+                ImuSample(
+                    stamp, sensor.name, 1e-3 * self._rng.normal(size=3), np.array([0, 0, 9.81])
+                ),
+            )
         s = self.robot.strain_stations
-        yield "strain", StrainSample(stamp, s, 0 * s, 0 * s)
-        yield "joint_states", EncoderSample(stamp, ("insertion",), np.zeros(1), np.zeros(1))
+        yield 'strain', StrainSample(stamp, s, 0 * s, 0 * s)
+        yield 'joint_states', EncoderSample(stamp, ('insertion',), np.zeros(1), np.zeros(1))
 
     def frame(self, sensor, stamp: int) -> TofFrame:
         """The distances to the box, to half a millimetre."""
@@ -190,14 +234,26 @@ class BoxRobot:
         T = self.T_map_ring[ring] @ sensor.mount.T_ring_sensor
         rays = self.robot.tof_model.directions
         directions = rays @ T[:3, :3].T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            walls = np.where(directions > 0.0, (BOX[1] - T[:3, 3]) / directions, (BOX[0] - T[:3, 3]) / directions)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            walls = np.where(
+                directions > 0.0,
+                (BOX[1] - T[:3, 3]) / directions,
+                (BOX[0] - T[:3, 3]) / directions,
+            )
         ranges = np.nanmin(np.where(directions == 0.0, np.inf, walls), axis=1)
         ranges = ranges + 5e-4 * self._rng.normal(size=len(ranges))
-        return TofFrame(stamp, sensor.name, ranges[:, None] * rays, ranges, self.robot.tof_model.sigma(ranges),
-                        np.full(len(rays), 5, np.uint8))
+        return TofFrame(
+            stamp,
+            sensor.name,
+            ranges[:, None] * rays,
+            ranges,
+            self.robot.tof_model.sigma(ranges),
+            np.full(len(rays), 5, np.uint8),
+        )
 
-    def play(self, client: Client, seconds: float, start: int | None = None, rate: float = 15.0) -> list[int]:
+    def play(
+        self, client: Client, seconds: float, start: int | None = None, rate: float = 15.0
+    ) -> list[int]:
         """Publish in real time; the stamps."""
         begin, origin = time.monotonic(), client.now() if start is None else start
         stamps = [origin + nanoseconds(tick / rate) for tick in range(round(seconds * rate))]
@@ -209,14 +265,19 @@ class BoxRobot:
         return stamps
 
     def _write_map(self) -> None:
-        lines = ["x,y,z,nx,ny,nz,planarity"]
+        lines = ['x,y,z,nx,ny,nz,planarity']
         for axis in range(3):
             others = [a for a in range(3) if a != axis]
-            grid = np.stack(np.meshgrid(*(np.arange(BOX[0, a], BOX[1, a] + 1e-9, 0.01) for a in others)), -1)
+            grid = np.stack(
+                np.meshgrid(*(np.arange(BOX[0, a], BOX[1, a] + 1e-9, 0.01) for a in others)), -1
+            )
             for side in range(2):
                 points = np.empty((grid[..., 0].size, 3))
                 points[:, others], points[:, axis] = grid.reshape(-1, 2), BOX[side, axis]
                 normal = [0, 0, 0]
                 normal[axis] = 1 - 2 * side  # into the box: where the robot is
-                lines += [f"{x:.4f},{y:.4f},{z:.4f},{normal[0]},{normal[1]},{normal[2]},1" for x, y, z in points]
-        self.map.write_text("\n".join(lines) + "\n")
+                lines += [
+                    f'{x:.4f},{y:.4f},{z:.4f},{normal[0]},{normal[1]},{normal[2]},1'
+                    for x, y, z in points
+                ]
+        self.map.write_text('\n'.join(lines) + '\n')

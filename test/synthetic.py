@@ -1,11 +1,10 @@
 """A body that bends and is inserted along a known path, samples of it, and an estimator with known errors."""
 
-import numpy as np
-
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Estimate
-from continuum_loc.measurements import NANOSECONDS, TOF_VALID, ImuSample, TofFrame, TruthSample
-from continuum_loc.robot import RobotDescription, load_robot
+from continuum_loc.measurements import ImuSample, NANOSECONDS, TOF_VALID, TofFrame, TruthSample
+from continuum_loc.robot import load_robot, RobotDescription
+import numpy as np
 
 START = 1_000_000_000
 
@@ -19,7 +18,9 @@ def poses_at(robot: RobotDescription, arclengths: np.ndarray, time: float) -> np
 
 def truth_at(robot: RobotDescription, stamp: int) -> np.ndarray:
     """(R + 1, 4, 4) true poses of base and rings."""
-    return poses_at(robot, np.concatenate([[0.0], robot.ring_arclengths]), (stamp - START) / NANOSECONDS)
+    return poses_at(
+        robot, np.concatenate([[0.0], robot.ring_arclengths]), (stamp - START) / NANOSECONDS
+    )
 
 
 def samples(robot: RobotDescription, duration: float, seed: int = 0):
@@ -38,24 +39,36 @@ def frame(robot: RobotDescription, name: str, stamp: int, rng: np.random.Generat
     """A frame of random ranges, one zone in ten without return."""
     ranges = rng.uniform(0.2, 0.6, len(robot.tof_model.directions))
     status = np.where(rng.random(len(ranges)) < 0.1, 255, TOF_VALID).astype(np.uint8)
-    return TofFrame(stamp, name, robot.tof_model.directions * ranges[:, None], ranges,
-                    robot.tof_model.sigma(ranges), status)
+    return TofFrame(
+        stamp,
+        name,
+        robot.tof_model.directions * ranges[:, None],
+        ranges,
+        robot.tof_model.sigma(ranges),
+        status,
+    )
 
 
 class NoisyFilter:
     """Answers each cycle of ToF frames with the true poses plus errors of exactly the covariance it states."""
 
-    def __init__(self, robot: RobotDescription | None = None, sigma: float = 0.002, seed: int = 0) -> None:
-        self.robot = robot or load_robot("engine")
+    def __init__(
+        self, robot: RobotDescription | None = None, sigma: float = 0.002, seed: int = 0
+    ) -> None:
+        self.robot = robot or load_robot('engine')
         self.sigma = sigma
-        self.counts = {"received": {"tof": 0, "imu": 0}, "used": {"tof": 0, "imu": 0}, "dropped": {}}
+        self.counts = {
+            'received': {'tof': 0, 'imu': 0},
+            'used': {'tof': 0, 'imu': 0},
+            'dropped': {},
+        }
         self._rng = np.random.default_rng(seed)
 
     def process(self, measurement):
-        kind = "tof" if isinstance(measurement, TofFrame) else "imu"
-        self.counts["received"][kind] += 1
-        self.counts["used"][kind] += 1
-        last = kind == "tof" and measurement.sensor == self.robot.tof[-1].name
+        kind = 'tof' if isinstance(measurement, TofFrame) else 'imu'
+        self.counts['received'][kind] += 1
+        self.counts['used'][kind] += 1
+        last = kind == 'tof' and measurement.sensor == self.robot.tof[-1].name
         return self._estimate(measurement.stamp) if last else None
 
     def flush(self):
@@ -63,13 +76,21 @@ class NoisyFilter:
 
     def _estimate(self, stamp: int, lagged: bool = True) -> Estimate:
         true = truth_at(self.robot, stamp)
-        growth = np.linspace(0.3, 1.0, len(true))[:, None] * self.sigma * np.array([1, 1, 1, 4, 4, 4])
+        growth = (
+            np.linspace(0.3, 1.0, len(true))[:, None] * self.sigma * np.array([1, 1, 1, 4, 4, 4])
+        )
         s = np.linspace(0.0, self.robot.length, 51)
         earlier = stamp - NANOSECONDS // 5
         return Estimate(
-            stamp=stamp, T_map_ring=true @ lie.exp(-growth * self._rng.normal(size=growth.shape)),
-            covariance=np.einsum("rk,kl->rkl", growth**2, np.eye(6)), strain=np.zeros((len(true), 6)),
-            velocity=np.zeros((len(true), 6)), velocity_covariance=np.tile(np.eye(6), (len(true), 1, 1)),
-            backbone_s=s, T_map_backbone=poses_at(self.robot, s, (stamp - START) / NANOSECONDS),
-            status="initialising" if stamp < START + NANOSECONDS // 2 else "tracking", consistency=1.0,
-            lagged=self._estimate(earlier, lagged=False) if lagged and earlier > START else None)
+            stamp=stamp,
+            T_map_ring=true @ lie.exp(-growth * self._rng.normal(size=growth.shape)),
+            covariance=np.einsum('rk,kl->rkl', growth**2, np.eye(6)),
+            strain=np.zeros((len(true), 6)),
+            velocity=np.zeros((len(true), 6)),
+            velocity_covariance=np.tile(np.eye(6), (len(true), 1, 1)),
+            backbone_s=s,
+            T_map_backbone=poses_at(self.robot, s, (stamp - START) / NANOSECONDS),
+            status='initialising' if stamp < START + NANOSECONDS // 2 else 'tracking',
+            consistency=1.0,
+            lagged=self._estimate(earlier, lagged=False) if lagged and earlier > START else None,
+        )

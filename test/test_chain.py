@@ -1,9 +1,8 @@
 """The chain against dense algebra: solution, covariances, and marginalisation equal to the batch."""
 
+from continuum_loc.estimator.chain import Blocks, Chain, Message, SingularError
 import numpy as np
 import pytest
-
-from continuum_loc.estimator.chain import Blocks, Chain, Message, SingularError
 
 D, K = 7, 6
 
@@ -24,23 +23,27 @@ def dense(start, intervals):
     H[:D, :D] += start.information
     g[:D] += start.gradient
     for k, block in enumerate(intervals):
-        H[D * k:D * (k + 2), D * k:D * (k + 2)] += block.H
-        g[D * k:D * (k + 2)] += block.g
+        H[D * k : D * (k + 2), D * k : D * (k + 2)] += block.H
+        g[D * k : D * (k + 2)] += block.g
     return H, g
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize('seed', range(3))
 def test_solution_and_covariances_equal_dense_algebra(seed):
     start, intervals = random_chain(seed)
     H, g = dense(start, intervals)
     chain = Chain(D, start)
-    np.testing.assert_allclose(np.concatenate(chain.solve(intervals, 0)), np.linalg.solve(H, -g), atol=1e-9)
+    np.testing.assert_allclose(
+        np.concatenate(chain.solve(intervals, 0)), np.linalg.solve(H, -g), atol=1e-9
+    )
     P = np.linalg.inv(H)
     A, B = np.random.default_rng(seed).normal(size=(2, 4, D))
     for k in range(K - 1):
         pair = slice(D * k, D * (k + 2))
         both = np.concatenate([A, B], axis=1)
-        np.testing.assert_allclose(chain.covariance(k, A, B), both @ P[pair, pair] @ both.T, atol=1e-9)
+        np.testing.assert_allclose(
+            chain.covariance(k, A, B), both @ P[pair, pair] @ both.T, atol=1e-9
+        )
         alone = slice(D * k, D * (k + 1))
         np.testing.assert_allclose(chain.covariance(k, A), A @ P[alone, alone] @ A.T, atol=1e-9)
 
@@ -65,12 +68,14 @@ def test_kept_messages_change_nothing():
     chain = Chain(D, start)
     chain.solve(intervals, 0)
     intervals[3] = Blocks(intervals[3].H * 1.5, intervals[3].g + 1.0)
-    np.testing.assert_allclose(chain.solve(intervals, 3), Chain(D, start).solve(intervals, 0), atol=1e-10)
+    np.testing.assert_allclose(
+        chain.solve(intervals, 3), Chain(D, start).solve(intervals, 0), atol=1e-10
+    )
 
 
 def test_an_unobserved_direction_is_said():
     start, intervals = random_chain(1)
     start.information[:] = 0.0
     intervals[0].H[0, :] = intervals[0].H[:, 0] = 0.0
-    with pytest.raises(SingularError, match="column 0"):
+    with pytest.raises(SingularError, match='column 0'):
         Chain(D, start).solve(intervals, 0)

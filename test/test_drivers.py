@@ -1,58 +1,61 @@
 """Raw fields of real drivers: the geometry of the sensor, and what a status means."""
 
-import numpy as np
-import pytest
+from continuum_loc.robot import TofModel
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from continuum_loc.robot import TofModel
 from msg_tools.convert import tof_frame, tof_message
 from msg_tools.drivers import fbg_sample, ism330_sample, vl53l5cx_frame
 from msg_tools.errors import ConvertError
 from msg_tools.factory import bag_messages
+import numpy as np
+import pytest
 
-VL53L5CX = TofModel(convention="perpendicular", flip_rows=True, flip_columns=True)
+VL53L5CX = TofModel(convention='perpendicular', flip_rows=True, flip_columns=True)
 
 
 @given(distance=st.integers(100, 4000))
 @settings(max_examples=20, deadline=None)
 def test_a_wall_across_the_axis_is_flat(distance):
     """Perpendicular distances of one value are a plane: every point has that x, and the ranges grow to the corners."""
-    frame = vl53l5cx_frame(VL53L5CX, "a", 1, [distance] * 64, [5] * 64)
+    frame = vl53l5cx_frame(VL53L5CX, 'a', 1, [distance] * 64, [5] * 64)
     np.testing.assert_allclose(frame.points[:, 0], distance / 1000)
     np.testing.assert_allclose(frame.ranges, np.linalg.norm(frame.points, axis=1))
     assert frame.ranges.max() / frame.ranges.min() > 1.1
-    back = tof_frame(tof_message(bag_messages(), frame))  # and the message is accepted as consistent
+    back = tof_frame(
+        tof_message(bag_messages(), frame)
+    )  # and the message is accepted as consistent
     np.testing.assert_allclose(back.ranges, frame.ranges, rtol=1e-6)
 
 
 def test_the_lens_is_undone():
     """The first zone of the mounted sensor looks to +y, +z of a frame whose rows and columns would begin at -y, -z."""
-    assert (vl53l5cx_frame(VL53L5CX, "a", 1, [1000] * 64, [5] * 64).points[0, 1:] > 0).all()
-    plain = TofModel(convention="perpendicular")
-    assert (vl53l5cx_frame(plain, "a", 1, [1000] * 64, [5] * 64).points[0, 1:] < 0).all()
+    assert (vl53l5cx_frame(VL53L5CX, 'a', 1, [1000] * 64, [5] * 64).points[0, 1:] > 0).all()
+    plain = TofModel(convention='perpendicular')
+    assert (vl53l5cx_frame(plain, 'a', 1, [1000] * 64, [5] * 64).points[0, 1:] < 0).all()
 
 
 def test_status_decides_what_a_distance_means():
     status = np.resize([5, 6, 9, 4, 10, 12, 13, 255], 64)
     distance = np.full(64, 800)
     distance[8] = 10  # closer than the sensor can see
-    frame = vl53l5cx_frame(VL53L5CX, "a", 1, distance, status, [7] * 64)
-    np.testing.assert_array_equal(np.isfinite(frame.ranges), np.isin(status, (5, 6, 9)) & (distance > 100))
+    frame = vl53l5cx_frame(VL53L5CX, 'a', 1, distance, status, [7] * 64)
+    np.testing.assert_array_equal(
+        np.isfinite(frame.ranges), np.isin(status, (5, 6, 9)) & (distance > 100)
+    )
     assert frame.ranges[8] == -np.inf and (frame.ranges[status == 255] == np.inf).all()
     assert np.isnan(frame.ranges[status == 4]).all()
     np.testing.assert_allclose(frame.sigma[np.isfinite(frame.ranges)], 0.007)
-    none = vl53l5cx_frame(VL53L5CX, "a", 1, distance, [5] * 64, nb_target_detected=[0] * 64)
+    none = vl53l5cx_frame(VL53L5CX, 'a', 1, distance, [5] * 64, nb_target_detected=[0] * 64)
     assert (none.ranges == np.inf).all()
 
 
 def test_arrays_must_fit_the_grid():
-    with pytest.raises(ConvertError, match="distance_mm: 16 values; valid: 64"):
-        vl53l5cx_frame(VL53L5CX, "a", 1, [1] * 16, [5] * 64)
+    with pytest.raises(ConvertError, match='distance_mm: 16 values; valid: 64'):
+        vl53l5cx_frame(VL53L5CX, 'a', 1, [1] * 16, [5] * 64)
 
 
 def test_ism330_at_its_data_sheet_sensitivities():
-    sample = ism330_sample("imu", 1, [0, 0, 10_000], [0, 0, 8197], 17.5, 0.122)
+    sample = ism330_sample('imu', 1, [0, 0, 10_000], [0, 0, 8197], 17.5, 0.122)
     assert np.degrees(sample.angular_velocity[2]) == pytest.approx(175.0)
     assert sample.linear_acceleration[2] == pytest.approx(9.807, abs=0.01)
 

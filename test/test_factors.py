@@ -1,42 +1,60 @@
 """Every factor's gradient and Hessian against finite differences of its own residuals, over random states."""
 
-import numpy as np
-import pytest
-from worlds import EPOCH, Rod, rod, room_map, stream
-
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.estimator.chain import Blocks
 from continuum_loc.estimator.factors import FACTORS, MeasurementError, TofFactor
 from continuum_loc.estimator.priors import Priors
-from continuum_loc.estimator.state import Grid, column_at_rest
+from continuum_loc.estimator.state import column_at_rest, Grid
 from continuum_loc.mapping.voxel_index import VoxelIndex
-from continuum_loc.measurements import EncoderSample, FieldSample, ImuSample, StrainSample, TofFrame, TrackedPose
+from continuum_loc.measurements import (
+    EncoderSample,
+    FieldSample,
+    ImuSample,
+    StrainSample,
+    TofFrame,
+    TrackedPose,
+)
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
+import numpy as np
+import pytest
+from worlds import EPOCH, Rod, rod, room_map, stream
 
 DT = 0.1
-LOOSE = {"cauchy": 1e6}  # the loss is frozen per iteration, so only the quadratic part has a gradient to compare
-SETTINGS = parse_settings(EstimatorSettings, {
-    "gyro": LOOSE, "field": LOOSE, "strain": LOOSE, "tracker": LOOSE,
-    # A floor that drowns the beam's own noise, whose share across the surface turns with the body.
-    "tof": {**LOOSE, "gate": 1.0, "min_cosine": 0.0, "floor": 100.0},
-    "gravity": {"enabled": True, "gate": 100.0}})
+LOOSE = {
+    'cauchy': 1e6
+}  # the loss is frozen per iteration, so only the quadratic part has a gradient to compare
+SETTINGS = parse_settings(
+    EstimatorSettings,
+    {
+        'gyro': LOOSE,
+        'field': LOOSE,
+        'strain': LOOSE,
+        'tracker': LOOSE,
+        # A floor that drowns the beam's own noise, whose share across the surface turns with the
+        # body.
+        'tof': {**LOOSE, 'gate': 1.0, 'min_cosine': 0.0, 'floor': 100.0},
+        'gravity': {'enabled': True, 'gate': 100.0},
+    },
+)
 
 
 def robot() -> RobotDescription:
     data = rod().model_dump()
-    mount = {"xyz": [0.01, 0.0, 0.005], "rpy_deg": [10.0, 20.0, 5.0]}
-    data["trackers"] = [{"name": "coil", "ring": "r2", "mount": mount}]
-    data["base"]["insertion"] = {"mode": "measured", "range": [0.0, 0.5], "sigma": 0.001}
-    data["magnet"] = {"remanence": 1.1}
-    data["hall"] = [{"name": "r1_hall", "ring": "r1"}]
+    mount = {'xyz': [0.01, 0.0, 0.005], 'rpy_deg': [10.0, 20.0, 5.0]}
+    data['trackers'] = [{'name': 'coil', 'ring': 'r2', 'mount': mount}]
+    data['base']['insertion'] = {'mode': 'measured', 'range': [0.0, 0.5], 'sigma': 0.001}
+    data['magnet'] = {'remanence': 1.1}
+    data['hall'] = [{'name': 'r1_hall', 'ring': 'r1'}]
     return parse_settings(RobotDescription, data)
 
 
 def columns(grid: Grid, seed: int):
     rng = np.random.default_rng(seed)
-    strain = np.tile([1.0, 0, 0, 0, 0, 0], (grid.nodes, 1)) + 0.2 * rng.normal(size=(grid.nodes, 6))
+    strain = np.tile([1.0, 0, 0, 0, 0, 0], (grid.nodes, 1)) + 0.2 * rng.normal(
+        size=(grid.nodes, 6)
+    )
     a = column_at_rest(grid, lie.exp(0.05 * rng.normal(size=6)), strain, 0.0)
     a = a.retract(0.05 * rng.normal(size=grid.dim))
     b = a.predict(DT).retract(0.02 * rng.normal(size=grid.dim))
@@ -46,31 +64,39 @@ def columns(grid: Grid, seed: int):
 def measurements(kind: str, description: RobotDescription):
     samples = list(stream(Rod(description), 0.1))
     rng = np.random.default_rng(1)
-    if kind in ("gyro", "gravity"):
+    if kind in ('gyro', 'gravity'):
         return [s for s in samples if isinstance(s, ImuSample)][:6]
-    if kind == "strain":
+    if kind == 'strain':
         return [s for s in samples if isinstance(s, StrainSample)]
-    if kind == "tof":
+    if kind == 'tof':
         return [s for s in samples if isinstance(s, TofFrame)][:7]
-    if kind == "field":
-        return [FieldSample(EPOCH, "r1_hall", 1e-6 * rng.normal(size=3)) for _ in range(4)]
-    if kind == "tracker":
+    if kind == 'field':
+        return [FieldSample(EPOCH, 'r1_hall', 1e-6 * rng.normal(size=3)) for _ in range(4)]
+    if kind == 'tracker':
         A = rng.normal(size=(6, 6))
         covariance = 1e-4 * (A @ A.T + np.eye(6))
-        return [TrackedPose(EPOCH, "coil", lie.exp(np.array([0.6, 0.0, 0.1, 0.2, 0.1, 3.0])), covariance)]
-    return [EncoderSample(EPOCH, ("tendon1", "insertion"), np.array([0.0, 0.2]), np.zeros(2))]
+        return [
+            TrackedPose(
+                EPOCH, 'coil', lie.exp(np.array([0.6, 0.0, 0.1, 0.2, 0.1, 3.0])), covariance
+            )
+        ]
+    return [EncoderSample(EPOCH, ('tendon1', 'insertion'), np.array([0.0, 0.2]), np.zeros(2))]
 
 
 def make_factor(kind: str, description: RobotDescription, grid: Grid):
-    if kind == "tof":
+    if kind == 'tof':
         prior_map = room_map(0.05)
-        return TofFactor(description, grid, SETTINGS, prior_map, VoxelIndex(prior_map.points, prior_map.normals))
+        return TofFactor(
+            description, grid, SETTINGS, prior_map, VoxelIndex(prior_map.points, prior_map.normals)
+        )
     factor = next(f for f in FACTORS if f.name == kind)
     return factor(description, grid, SETTINGS)
 
 
-@pytest.mark.parametrize("kind", ["gyro", "strain", "tof", "tracker", "insertion", "gravity", "field"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    'kind', ['gyro', 'strain', 'tof', 'tracker', 'insertion', 'gravity', 'field']
+)
+@pytest.mark.parametrize('seed', [0, 1])
 def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
     description = robot()
     grid = Grid(description, 0.16)
@@ -84,18 +110,29 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
     rng = np.random.default_rng(seed)
     for _ in range(8):
         x, step = rng.normal(size=2 * grid.dim), 1e-6
-        if kind == "gravity":
-            x[grid.bias_offset:grid.dim] = 0.0
-        ends = [factor.linearise(batch, a.retract(sign * step * x[:grid.dim]), b.retract(sign * step * x[grid.dim:]),
-                                 Blocks.zeros(grid.dim)).squared for sign in (1.0, -1.0)]
+        if kind == 'gravity':
+            x[grid.bias_offset : grid.dim] = 0.0
+        ends = [
+            factor.linearise(
+                batch,
+                a.retract(sign * step * x[: grid.dim]),
+                b.retract(sign * step * x[grid.dim :]),
+                Blocks.zeros(grid.dim),
+            ).squared
+            for sign in (1.0, -1.0)
+        ]
         slope = (ends[0] - ends[1]) / (4.0 * step)
         scale = np.linalg.norm(blocks.g) * np.linalg.norm(x) / np.sqrt(len(x))
-        if kind == "tof":  # planarity weighs the information, not the reported squares; here it is one everywhere
+        if (
+            kind == 'tof'
+        ):  # planarity weighs the information, not the reported squares; here it is one everywhere
             assert np.all(factor._planarity == 1.0)
         assert slope == pytest.approx(blocks.g @ x, abs=1e-5 * scale + 1e-6 * abs(slope))
 
 
-@pytest.mark.parametrize("kind", ["gyro", "strain", "tof", "tracker", "insertion", "gravity", "field"])
+@pytest.mark.parametrize(
+    'kind', ['gyro', 'strain', 'tof', 'tracker', 'insertion', 'gravity', 'field']
+)
 def test_hessian_is_symmetric_and_positive_semidefinite(kind):
     description = robot()
     grid = Grid(description, 0.16)
@@ -107,7 +144,7 @@ def test_hessian_is_symmetric_and_positive_semidefinite(kind):
     assert np.linalg.eigvalsh(blocks.H)[0] > -1e-9 * np.abs(blocks.H).max()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize('seed', range(3))
 def test_prior_gradient(seed):
     description = robot()
     grid = Grid(description, 0.16)
@@ -116,13 +153,15 @@ def test_prior_gradient(seed):
 
     def blocks_at(x):
         out = Blocks.zeros(grid.dim)
-        priors.add(out, a.retract(x[:grid.dim]), b.retract(x[grid.dim:]))
+        priors.add(out, a.retract(x[: grid.dim]), b.retract(x[grid.dim :]))
         return out
 
     centre, rng = blocks_at(np.zeros(2 * grid.dim)), np.random.default_rng(seed)
     for _ in range(8):
         x, step = rng.normal(size=2 * grid.dim), 1e-6
-        x[grid.bias_offset:grid.dim] = x[grid.dim + grid.bias_offset:] = 0.0  # the bias walk reports no cost
+        x[grid.bias_offset : grid.dim] = x[grid.dim + grid.bias_offset :] = (
+            0.0  # the bias walk reports no cost
+        )
         slope = (blocks_at(step * x).cost - blocks_at(-step * x).cost) / (2.0 * step)
         assert slope == pytest.approx(centre.g @ x, rel=1e-6)
     np.testing.assert_allclose(centre.H, centre.H.T, atol=1e-12 * np.abs(centre.H).max())
@@ -131,21 +170,25 @@ def test_prior_gradient(seed):
 def test_strain_matches_the_papers_map():
     """Eqs. 7-8: Ad(Rx(theta)) [1 0 0 0 0 kappa] has the bending that the factor takes as measured."""
     description = robot()
-    factor = make_factor("strain", description, Grid(description, 0.16))
+    factor = make_factor('strain', description, Grid(description, 0.16))
     theta, kappa = np.array([0.3, -2.0]), np.array([0.8, 1.5])
     _, bending, _ = factor.row(StrainSample(EPOCH, np.array([0.1, 0.5]), theta, kappa))
     for i in range(2):
         T = np.eye(4)
         T[:3, :3] = lie.so3_exp(np.array([theta[i], 0.0, 0.0]))
-        np.testing.assert_allclose(bending[i], (lie.adjoint(T) @ [1, 0, 0, 0, 0, kappa[i]])[4:], atol=1e-12)
+        np.testing.assert_allclose(
+            bending[i], (lie.adjoint(T) @ [1, 0, 0, 0, 0, kappa[i]])[4:], atol=1e-12
+        )
 
 
 def test_strain_noise_across_the_bending_plane():
     """Across the plane the noise is kappa sigma_theta where that is larger, along it sigma_kappa."""
     description = robot()
-    factor = make_factor("strain", description, Grid(description, 0.16))
+    factor = make_factor('strain', description, Grid(description, 0.16))
     kappa = 4.0
-    _, bending, information = factor.row(StrainSample(EPOCH, np.array([0.1]), np.array([0.7]), np.array([kappa])))
+    _, bending, information = factor.row(
+        StrainSample(EPOCH, np.array([0.1]), np.array([0.7]), np.array([kappa]))
+    )
     covariance, along = np.linalg.inv(information[0]), bending[0] / kappa
     scale, noise = SETTINGS.strain.scale, description.strain
     assert along @ covariance @ along == pytest.approx((scale * noise.kappa_sigma) ** 2)
@@ -153,9 +196,9 @@ def test_strain_noise_across_the_bending_plane():
     assert across @ covariance @ across == pytest.approx((scale * kappa * noise.theta_sigma) ** 2)
 
 
-@pytest.mark.parametrize("name, message", [("nobody", "valid: r1_imu, r2_imu")])
+@pytest.mark.parametrize('name, message', [('nobody', 'valid: r1_imu, r2_imu')])
 def test_unknown_sensors_are_refused_with_the_valid_names(name, message):
     description = robot()
-    factor = make_factor("gyro", description, Grid(description, 0.16))
+    factor = make_factor('gyro', description, Grid(description, 0.16))
     with pytest.raises(MeasurementError, match=message):
         factor.row(ImuSample(EPOCH, name, np.zeros(3), np.zeros(3)))

@@ -1,10 +1,9 @@
 """The Gaussian process: exact on constant rates, Jacobians by finite differences, the bridge by conditioning."""
 
-import numpy as np
-import pytest
-
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp
+import numpy as np
+import pytest
 
 
 def pair(angle: float, seed: int):
@@ -21,8 +20,10 @@ def perturbed(state, x):
 
 
 def central(function, state, step=1e-6):
-    columns = [(function(perturbed(state, step * e)) - function(perturbed(state, -step * e))) / (2 * step)
-               for e in np.eye(24)]
+    columns = [
+        (function(perturbed(state, step * e)) - function(perturbed(state, -step * e))) / (2 * step)
+        for e in np.eye(24)
+    ]
     return np.array(columns).T
 
 
@@ -38,8 +39,8 @@ def transport(state):
     return e, J
 
 
-@pytest.mark.parametrize("angle", [1e-8, 0.05, 0.6, 2.0, 3.1])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize('angle', [1e-8, 0.05, 0.6, 2.0, 3.1])
+@pytest.mark.parametrize('seed', range(3))
 def test_prior_jacobians(angle, seed):
     state = pair(angle, seed)
     for function in (motion, transport):
@@ -48,8 +49,8 @@ def test_prior_jacobians(angle, seed):
         np.testing.assert_allclose(analytic, numeric, atol=1e-6 * np.abs(numeric).max())
 
 
-@pytest.mark.parametrize("angle", [1e-8, 0.05, 0.6, 2.0, 3.1])
-@pytest.mark.parametrize("fraction", [0.0, 0.2, 0.7, 1.0])
+@pytest.mark.parametrize('angle', [1e-8, 0.05, 0.6, 2.0, 3.1])
+@pytest.mark.parametrize('fraction', [0.0, 0.2, 0.7, 1.0])
 def test_interpolation_jacobians(angle, fraction):
     state, d = pair(angle, 5), 0.1
     T, v, J_pose, J_rate = gp.interpolate(*state, d, fraction * d)

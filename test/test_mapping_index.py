@@ -1,13 +1,12 @@
 """The index is exact: against brute force and SciPy, for any cloud and query, whatever its cache holds."""
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial import cKDTree
-
 from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.voxel_index import PATIENCE, VoxelIndex
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
 
 
 def wavy_cylinder(count, seed):
@@ -30,12 +29,21 @@ def brute_force(points, queries, max_distance, allowed=None):
 
 def clouds():
     """Clouds that break indices: few points, coincident ones, lines, lattices with ties, far outliers."""
-    coordinate = st.one_of(st.integers(-3, 3).map(float), st.floats(-1.0, 1.0), st.sampled_from([0.0, 1e-9, 50.0]))
-    return st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=60).map(np.array)
+    coordinate = st.one_of(
+        st.integers(-3, 3).map(float), st.floats(-1.0, 1.0), st.sampled_from([0.0, 1e-9, 50.0])
+    )
+    return st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=60).map(
+        np.array
+    )
 
 
 @settings(max_examples=150, deadline=None)
-@given(clouds(), clouds(), st.sampled_from([1e-3, 0.05, 0.3, 2.0, np.inf]), st.sampled_from([None, 0.02, 0.5, 7.0]))
+@given(
+    clouds(),
+    clouds(),
+    st.sampled_from([1e-3, 0.05, 0.3, 2.0, np.inf]),
+    st.sampled_from([None, 0.02, 0.5, 7.0]),
+)
 def test_nearest_is_the_nearest_of_any_cloud(points, queries, max_distance, voxel):
     index = VoxelIndex(points, voxel=voxel, reach=0.2)
     for _ in range(PATIENCE + 1):  # first by search, then from the lists
@@ -44,7 +52,9 @@ def test_nearest_is_the_nearest_of_any_cloud(points, queries, max_distance, voxe
         np.testing.assert_allclose(distance, expected, rtol=1e-12, atol=1e-15)
         hit = row >= 0
         np.testing.assert_array_equal(hit, np.isfinite(expected))
-        np.testing.assert_allclose(np.linalg.norm(points[row[hit]] - queries[hit], axis=1), distance[hit])
+        np.testing.assert_allclose(
+            np.linalg.norm(points[row[hit]] - queries[hit], axis=1), distance[hit]
+        )
 
 
 @settings(max_examples=60, deadline=None)
@@ -57,8 +67,10 @@ def test_nearest_facing_is_the_nearest_that_faces(seed, min_cos, max_distance):
     directions = rng.normal(size=(40, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     index = VoxelIndex(points, normals)
-    cosine = -np.einsum("qi,pi->qp", directions, normals)
-    clear = np.abs(cosine - min_cos).min(axis=1) > 1e-12  # rounding may decide either way on the limit itself
+    cosine = -np.einsum('qi,pi->qp', directions, normals)
+    clear = (
+        np.abs(cosine - min_cos).min(axis=1) > 1e-12
+    )  # rounding may decide either way on the limit itself
     expected = brute_force(points, queries, max_distance, cosine >= min_cos)
     for _ in range(PATIENCE + 1):
         _, distance = index.nearest_facing(queries, directions, max_distance, min_cos)
@@ -68,7 +80,9 @@ def test_nearest_facing_is_the_nearest_that_faces(seed, min_cos, max_distance):
 def test_agrees_with_a_kd_tree_on_a_large_map_near_and_far():
     points, _ = wavy_cylinder(100_000, 1)
     rng = np.random.default_rng(2)
-    queries = np.concatenate([points[:3000] + rng.normal(0, 0.02, (3000, 3)), rng.uniform(-1, 1, (500, 3))])
+    queries = np.concatenate(
+        [points[:3000] + rng.normal(0, 0.02, (3000, 3)), rng.uniform(-1, 1, (500, 3))]
+    )
     index = VoxelIndex(points)
     for _ in range(PATIENCE):
         _, distance = index.nearest(queries)
@@ -91,20 +105,22 @@ def test_a_cache_that_overflows_changes_nothing():
     queries = points[:4000] + np.random.default_rng(5).normal(0, 0.01, (4000, 3))
     small, large = VoxelIndex(points, cache_cells=64), VoxelIndex(points)
     for _ in range(PATIENCE):
-        np.testing.assert_array_equal(small.nearest(queries, 0.1)[0], large.nearest(queries, 0.1)[0])
-    assert small.cache_use["emptied"] > 0 and large.cache_use["emptied"] == 0
-    assert small.cache_use["cells"] <= 65
+        np.testing.assert_array_equal(
+            small.nearest(queries, 0.1)[0], large.nearest(queries, 0.1)[0]
+        )
+    assert small.cache_use['emptied'] > 0 and large.cache_use['emptied'] == 0
+    assert small.cache_use['cells'] <= 65
 
 
 def test_copies_share_the_cloud_and_not_the_cache():
     index = VoxelIndex(wavy_cylinder(1000, 6)[0])
     twin = index.copy()
     twin.nearest(np.tile(index.arrays.points[0, :3], (20, 1)))
-    assert twin.cache_use["made"] == 1 and index.cache_use["made"] == 0
+    assert twin.cache_use['made'] == 1 and index.cache_use['made'] == 0
     assert twin.arrays.points is index.arrays.points
 
 
-@pytest.mark.parametrize("query", [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300]])
+@pytest.mark.parametrize('query', [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300]])
 def test_a_query_that_is_no_place_has_no_neighbour(query):
     row, distance = VoxelIndex(np.zeros((1, 3)), voxel=0.1).nearest(np.array([query]))
     assert row[0] == -1 and distance[0] == np.inf
@@ -116,19 +132,24 @@ def test_max_distance_is_a_strict_limit():
     assert index.nearest(np.array([[0.25, 0.0, 0.0]]), 0.2500001)[0][0] == 0
 
 
-@pytest.mark.parametrize(("points", "said"), [
-    (np.empty((0, 3)), r"\(P, 3\)"), (np.zeros((4, 2)), r"\(4, 2\)"),
-    (np.array([[0, 0, 0], [0, np.nan, 0.0]]), "first is row 1")])
+@pytest.mark.parametrize(
+    ('points', 'said'),
+    [
+        (np.empty((0, 3)), r'\(P, 3\)'),
+        (np.zeros((4, 2)), r'\(4, 2\)'),
+        (np.array([[0, 0, 0], [0, np.nan, 0.0]]), 'first is row 1'),
+    ],
+)
 def test_unusable_points_are_refused_by_name(points, said):
     with pytest.raises(MapError, match=said):
         VoxelIndex(points)
 
 
 def test_a_voxel_too_small_for_the_cloud_is_refused():
-    with pytest.raises(MapError, match="too small"):
+    with pytest.raises(MapError, match='too small'):
         VoxelIndex(np.array([[0.0, 0, 0], [1e4, 0, 0]]), voxel=1e-4)
 
 
 def test_facing_needs_normals():
-    with pytest.raises(MapError, match="normals"):
+    with pytest.raises(MapError, match='normals'):
         VoxelIndex(np.zeros((1, 3))).nearest_facing(np.zeros((1, 3)), np.ones((1, 3)))

@@ -1,30 +1,29 @@
 """Reconstruction and anomalies: covariance against Monte Carlo, detection in rooms whose differences are known."""
 
-import numpy as np
-import pytest
-import trimesh
-from scipy import stats
-
 from continuum_loc import lie
 from continuum_loc.mapping.anomalies import (
     AnomalySettings,
-    Evidence,
-    Truth,
     clusters,
     detect_anomalies,
+    Evidence,
     mahalanobis2,
     precision_recall,
     seen,
+    Truth,
     wilson_lower_bound,
 )
 from continuum_loc.mapping.build import sample_mesh
 from continuum_loc.mapping.errors import MapError
-from continuum_loc.mapping.reconstruct import RingTrajectory, reconstruct, root_mean_square
+from continuum_loc.mapping.reconstruct import reconstruct, RingTrajectory, root_mean_square
 from continuum_loc.mapping.splat_cast import first_crossings
 from continuum_loc.measurements import TofFrame
 from continuum_loc.robot import load_robot
+import numpy as np
+import pytest
+from scipy import stats
+import trimesh
 
-ROBOT = load_robot("soft_arm")
+ROBOT = load_robot('soft_arm')
 FRAMES = 40
 WIDE = AnomalySettings(cell=0.03)
 PERIOD = 66_666_667  # ns
@@ -69,16 +68,26 @@ def measured(trajectory, mesh, seed=0, noise=True):
     for stamp, T_map_ring in zip(trajectory.stamps, trajectory.T_map_ring, strict=True):
         for sensor in ROBOT.tof:
             T = T_map_ring[ROBOT.ring_names.index(sensor.ring) + 1] @ sensor.mount.T_ring_sensor
-            rays = np.column_stack([np.tile(T[:3, 3], (len(zones), 1)), zones @ T[:3, :3].T]).astype(np.float32)
-            ranges = scene.cast_rays(rays, nthreads=1)["t_hit"].numpy().astype(float)
+            rays = np.column_stack(
+                [np.tile(T[:3, 3], (len(zones), 1)), zones @ T[:3, :3].T]
+            ).astype(np.float32)
+            ranges = scene.cast_rays(rays, nthreads=1)['t_hit'].numpy().astype(float)
             sigma = ROBOT.tof_model.sigma(ranges)
             ranges += noise * sigma * rng.normal(size=len(zones))
-            frames.append(TofFrame(int(stamp), sensor.name, ranges[:, None] * zones, ranges, sigma,
-                                   np.full(len(zones), 5, np.uint8)))
+            frames.append(
+                TofFrame(
+                    int(stamp),
+                    sensor.name,
+                    ranges[:, None] * zones,
+                    ranges,
+                    sigma,
+                    np.full(len(zones), 5, np.uint8),
+                )
+            )
     return frames
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope='module')
 def changed_room():
     """(trajectory, frames, map): the map has the cube, the room has the ball."""
     trajectory = swaying()
@@ -97,10 +106,14 @@ def test_without_noise_every_point_lies_on_the_mesh():
 def test_covariance_matches_monte_carlo():
     """Draw poses and ranges as the covariances state them; the scatter of the points is eq. 11's (5 % of its norm)."""
     rng = np.random.default_rng(1)
-    root = np.diag([0.004, 0.003, 0.005, 0.01, 0.02, 0.015]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
+    root = np.diag([0.004, 0.003, 0.005, 0.01, 0.02, 0.015]) @ (
+        np.eye(6) + 0.3 * rng.normal(size=(6, 6))
+    )
     covariance = root @ root.T
     base = swaying()
-    trajectory = RingTrajectory(base.stamps[:2], base.T_map_ring[:2], np.tile(covariance, (2, 4, 1, 1)))
+    trajectory = RingTrajectory(
+        base.stamps[:2], base.T_map_ring[:2], np.tile(covariance, (2, 4, 1, 1))
+    )
     frame = measured(base, room(), noise=False)[4]
     cloud = reconstruct(ROBOT, [frame], trajectory, floor=0.0, body_margin=-ROBOT.radius)
     sensor = ROBOT.sensor(frame.sensor)
@@ -109,8 +122,13 @@ def test_covariance_matches_monte_carlo():
     T = T_map_ring @ lie.exp(rng.normal(size=(draws, 6)) @ root.T) @ sensor.mount.T_ring_sensor
     for zone in (0, 27, 63):
         ranges = frame.ranges[zone] + frame.sigma[zone] * rng.normal(size=(draws, 1))
-        points = np.einsum("nij,nj->ni", T[:, :3, :3], ranges * ROBOT.tof_model.directions[zone]) + T[:, :3, 3]
-        error = np.linalg.norm(np.cov(points.T) - cloud.covariance[zone]) / np.linalg.norm(cloud.covariance[zone])
+        points = (
+            np.einsum('nij,nj->ni', T[:, :3, :3], ranges * ROBOT.tof_model.directions[zone])
+            + T[:, :3, 3]
+        )
+        error = np.linalg.norm(np.cov(points.T) - cloud.covariance[zone]) / np.linalg.norm(
+            cloud.covariance[zone]
+        )
         assert error < 0.05
 
 
@@ -118,7 +136,9 @@ def test_points_are_consistent_with_their_covariance():
     """Normalised distances to a plane have unit variance: the floor of the room, at 0.1 % false alarms."""
     trajectory = swaying()
     cloud = reconstruct(ROBOT, measured(trajectory, room(), seed=2), trajectory, floor=1e-6)
-    down = (cloud.origins - cloud.points)[:, 2] > 0.9 * np.linalg.norm(cloud.origins - cloud.points, axis=1)
+    down = (cloud.origins - cloud.points)[:, 2] > 0.9 * np.linalg.norm(
+        cloud.origins - cloud.points, axis=1
+    )
     on_floor = down & (np.abs(cloud.points[:, :2]).max(axis=1) < 0.3)
     z = cloud.points[on_floor, 2] / np.sqrt(cloud.covariance[on_floor, 2, 2])
     assert len(z) > 300
@@ -131,7 +151,9 @@ def test_zones_that_see_the_robot_itself_are_dropped_and_counted():
     frame = measured(trajectory, room(), noise=False)[0]
     T_ring_sensor = ROBOT.sensor(frame.sensor).mount.T_ring_sensor
     points = frame.points.copy()
-    points[:5] = (lie.inverse(T_ring_sensor) @ np.array([-0.05, 0.0, 0.03, 1.0]))[:3]  # beside the backbone
+    points[:5] = (lie.inverse(T_ring_sensor) @ np.array([-0.05, 0.0, 0.03, 1.0]))[
+        :3
+    ]  # beside the backbone
     touched = TofFrame(frame.stamp, frame.sensor, points, frame.ranges, frame.sigma, frame.status)
     cloud = reconstruct(ROBOT, [touched], trajectory)
     assert cloud.on_body == 5 and len(cloud.points) == 59
@@ -142,11 +164,17 @@ def test_frames_outside_the_trajectory_are_counted_and_strange_ones_refused():
     frames = measured(trajectory, room())
     half = RingTrajectory(trajectory.stamps[:20], trajectory.T_map_ring[:20])
     assert reconstruct(ROBOT, frames, half).skipped == 20 * len(ROBOT.tof)
-    late = TofFrame(10**12, frames[0].sensor, *(getattr(frames[0], n) for n in ("points", "ranges", "sigma", "status")))
-    with pytest.raises(MapError, match="none of the 1 ToF frames"):
+    late = TofFrame(
+        10**12,
+        frames[0].sensor,
+        *(getattr(frames[0], n) for n in ('points', 'ranges', 'sigma', 'status')),
+    )
+    with pytest.raises(MapError, match='none of the 1 ToF frames'):
         reconstruct(ROBOT, [late], trajectory)
-    other = TofFrame(0, "nose_tof", *(getattr(frames[0], n) for n in ("points", "ranges", "sigma", "status")))
-    with pytest.raises(MapError, match="nose_tof.*ring1_tof1"):
+    other = TofFrame(
+        0, 'nose_tof', *(getattr(frames[0], n) for n in ('points', 'ranges', 'sigma', 'status'))
+    )
+    with pytest.raises(MapError, match='nose_tof.*ring1_tof1'):
         reconstruct(ROBOT, [other], trajectory)
 
 
@@ -155,8 +183,8 @@ def test_a_reconstruction_is_saved_with_sigma_and_flags(tmp_path):
 
     trajectory = swaying()
     cloud = reconstruct(ROBOT, measured(trajectory, room())[:9], trajectory)
-    cloud.save(tmp_path / "scene.ply", anomaly=np.arange(len(cloud.points)) % 2)
-    read = open3d.t.io.read_point_cloud(str(tmp_path / "scene.ply")).point
+    cloud.save(tmp_path / 'scene.ply', anomaly=np.arange(len(cloud.points)) % 2)
+    read = open3d.t.io.read_point_cloud(str(tmp_path / 'scene.ply')).point
     np.testing.assert_array_equal(read.positions.numpy(), cloud.points)
     np.testing.assert_allclose(read.sigma.numpy().ravel(), cloud.sigma, rtol=1e-6)
     assert read.anomaly.numpy().sum() == len(cloud.points) // 2
@@ -169,14 +197,15 @@ def test_rays_cross_the_mapped_surface_where_they_cross_the_mesh():
     directions = rng.normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = -2.0 * directions + 0.3 * rng.normal(size=(2000, 3))
-    closest = np.einsum("ij,ij->i", origins, directions)
+    closest = np.einsum('ij,ij->i', origins, directions)
     miss = np.linalg.norm(origins - closest[:, None] * directions, axis=1)
     depth = -closest - np.sqrt(np.maximum(1.0 - miss**2, 0.0))
     row, found = first_crossings(prior, prior.index(), origins, directions, np.full(2000, 5.0))
     inside = miss < 0.9
     assert np.mean(row[inside] >= 0) > 0.99
     hit = inside & (row >= 0)
-    # A disc of radius r stands off a unit sphere by r^2 / 2 at most, seen at a cosine of at least 0.43.
+    # A disc of radius r stands off a unit sphere by r^2 / 2 at most, seen at a cosine of at least
+    # 0.43.
     assert np.abs(found - depth)[hit].max() < 2.0 * 0.02**2 / 2 / 0.43 + 1e-3
     assert np.all(row[miss > 1.03] == -1)
 
@@ -185,8 +214,11 @@ def test_new_and_missing_things_are_found_and_nothing_else(changed_room):
     trajectory, frames, prior = changed_room
     cloud = reconstruct(ROBOT, frames, trajectory)
     detected = detect_anomalies(cloud, prior)
-    assert sorted(cluster.kind for cluster in detected) == ["added", "missing"]
-    truth = [Truth("added", BALL.vertices, BALL.faces), Truth("missing", CUBE.vertices, CUBE.faces)]
+    assert sorted(cluster.kind for cluster in detected) == ['added', 'missing']
+    truth = [
+        Truth('added', BALL.vertices, BALL.faces),
+        Truth('missing', CUBE.vertices, CUBE.faces),
+    ]
     assert seen(truth, cloud) == truth
     result = precision_recall(detected, truth, [0.0, 0.5, 0.9])
     np.testing.assert_array_equal(result.precision, 1.0)
@@ -198,7 +230,10 @@ def test_new_and_missing_things_are_found_and_nothing_else(changed_room):
 def test_an_unchanged_room_has_no_anomalies():
     trajectory, mesh = swaying(), room(COMMON)
     prior = sample_mesh(mesh.vertices, mesh.faces, spacing=0.005)
-    assert detect_anomalies(reconstruct(ROBOT, measured(trajectory, mesh, seed=4), trajectory), prior) == []
+    assert (
+        detect_anomalies(reconstruct(ROBOT, measured(trajectory, mesh, seed=4), trajectory), prior)
+        == []
+    )
 
 
 def test_points_on_the_map_pass_the_chi2_test_at_its_level():
@@ -214,11 +249,11 @@ def test_points_on_the_map_pass_the_chi2_test_at_its_level():
 def test_witnesses_to_the_contrary_lower_the_confidence():
     rng = np.random.default_rng(6)
     places, stamps = rng.uniform(0, 0.03, (60, 3)), np.arange(60)
-    alone = clusters(Evidence(places, np.ones(60, bool), stamps), "added", WIDE)
-    disputed = clusters(Evidence(places, np.arange(60) % 3 > 0, stamps), "added", WIDE)
-    denied = clusters(Evidence(places, np.arange(60) % 3 == 0, stamps), "added", WIDE)
+    alone = clusters(Evidence(places, np.ones(60, bool), stamps), 'added', WIDE)
+    disputed = clusters(Evidence(places, np.arange(60) % 3 > 0, stamps), 'added', WIDE)
+    denied = clusters(Evidence(places, np.arange(60) % 3 == 0, stamps), 'added', WIDE)
     assert alone[0].confidence > 0.9 > disputed[0].confidence > 0.4 and denied == []
-    one_frame = clusters(Evidence(places, np.ones(60, bool), np.zeros(60)), "added", WIDE)
+    one_frame = clusters(Evidence(places, np.ones(60, bool), np.zeros(60)), 'added', WIDE)
     assert one_frame == []
 
 
@@ -232,7 +267,10 @@ def test_wilson_bound_covers_the_true_share_as_often_as_it_says():
 def test_precision_and_recall_count_kind_and_place(changed_room):
     trajectory, frames, prior = changed_room
     detected = detect_anomalies(reconstruct(ROBOT, frames, trajectory), prior)
-    swapped = [Truth("missing", BALL.vertices, BALL.faces), Truth("added", CUBE.vertices, CUBE.faces)]
+    swapped = [
+        Truth('missing', BALL.vertices, BALL.faces),
+        Truth('added', CUBE.vertices, CUBE.faces),
+    ]
     result = precision_recall(detected, swapped, [0.0])
     assert result.precision[0] == 0.0 and result.recall[0] == 0.0
     nothing_kept = precision_recall(detected, swapped, [1.1])

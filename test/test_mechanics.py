@@ -1,19 +1,25 @@
 """The simulated rod obeys mechanics: statics, stretch, frequency, dissipation, tendons."""
 
-import mujoco
-import numpy as np
-import pytest
+from continuum_loc.evaluation.studies.simulator import first_mode
+from continuum_loc.robot import Ring, RobotDescription
+from continuum_loc.settings import parse_settings, SettingsError
+from continuum_loc.simulator import model as rod_model
+from continuum_loc.simulator.model import (
+    advance,
+    build_model,
+    GRAVITY,
+    settle,
+    SimulationDiverged,
+    uniform_rod,
+)
+from continuum_loc.simulator.plant import load_plant, node_arclengths, PlantSettings
+from continuum_loc.simulator.reference import cosserat_shape, elastica_tip
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-
-from continuum_loc.evaluation.studies.simulator import first_mode
-from continuum_loc.robot import Ring, RobotDescription
-from continuum_loc.settings import SettingsError, parse_settings
-from continuum_loc.simulator import model as rod_model
-from continuum_loc.simulator.model import GRAVITY, SimulationDiverged, advance, build_model, settle, uniform_rod
-from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclengths
-from continuum_loc.simulator.reference import cosserat_shape, elastica_tip
+import mujoco
+import numpy as np
+import pytest
 
 LENGTH, EI, MASS = 1.0, 0.05, 0.02
 
@@ -24,7 +30,7 @@ def settled_tip(links, force=(0, 0, 0), moment=(0, 0, 0), supported=True, **kwar
     data.xfrc_applied[-1] = [*force, *moment]
     settle(model, data, rest_speed=1e-6)
     mujoco.mj_forward(model, data)
-    return data.body("tip").xpos.copy(), data.body("tip").xmat.reshape(3, 3).copy()
+    return data.body('tip').xpos.copy(), data.body('tip').xmat.reshape(3, 3).copy()
 
 
 def test_reference_solutions_agree_with_each_other():
@@ -39,7 +45,7 @@ def test_small_end_load_bends_a_cantilever_by_PL3_over_3EI():
     assert -tip[2] == pytest.approx(1e-3 * LENGTH**3 / (3 * EI), rel=2e-3)
 
 
-@pytest.mark.parametrize("force", [0.05, 0.2, 0.5])
+@pytest.mark.parametrize('force', [0.05, 0.2, 0.5])
 def test_large_end_load_gives_the_elastica(force):
     tip, _ = settled_tip(24, force=(0, 0, -force))
     x, drop = elastica_tip(force, EI, LENGTH)
@@ -65,30 +71,45 @@ def test_own_weight_and_a_load_out_of_plane_give_the_cosserat_rod():
 
 def test_tip_error_falls_with_the_square_of_the_link_length():
     x, drop = elastica_tip(0.2, EI, LENGTH)
-    errors = [np.linalg.norm(settled_tip(n, force=(0, 0, -0.2))[0] - [x, 0.0, -drop]) for n in (8, 16, 32)]
+    errors = [
+        np.linalg.norm(settled_tip(n, force=(0, 0, -0.2))[0] - [x, 0.0, -drop])
+        for n in (8, 16, 32)
+    ]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert np.all((orders > 1.9) & (orders < 2.1)), orders
 
 
 def test_hanging_rod_stretches_by_half_its_weight_over_its_stiffness():
     stiffness = 40.0
-    robot = RobotDescription(name="rod", length=LENGTH, radius=0.01, rings=(Ring(name="end", s=LENGTH),),
-                             base={"rpy_deg": (0.0, 90.0, 0.0)})
-    plant = PlantSettings(EI=EI, GJ=EI, EA=stiffness, mass_per_metre=MASS,
-                          profiles={"live": {"link_length": LENGTH / 20, "time_step": 0.005}})
+    robot = RobotDescription(
+        name='rod',
+        length=LENGTH,
+        radius=0.01,
+        rings=(Ring(name='end', s=LENGTH),),
+        base={'rpy_deg': (0.0, 90.0, 0.0)},
+    )
+    plant = PlantSettings(
+        EI=EI,
+        GJ=EI,
+        EA=stiffness,
+        mass_per_metre=MASS,
+        profiles={'live': {'link_length': LENGTH / 20, 'time_step': 0.005}},
+    )
     model = build_model(robot, plant)
     data = mujoco.MjData(model)
     settle(model, data, rest_speed=1e-6)
     mujoco.mj_forward(model, data)
-    stretch = -data.body("node20").xpos[2] - LENGTH
+    stretch = -data.body('node20').xpos[2] - LENGTH
     assert stretch == pytest.approx(MASS * GRAVITY * LENGTH**2 / (2 * stiffness), rel=2e-3)
 
 
-@pytest.mark.parametrize("time_step", [0.002, 0.005])
-def test_first_mode_has_the_frequency_of_euler_and_bernoulli_and_the_integrators_damping(time_step):
+@pytest.mark.parametrize('time_step', [0.002, 0.005])
+def test_first_mode_has_the_frequency_of_euler_and_bernoulli_and_the_integrators_damping(
+    time_step,
+):
     found = first_mode(24, time_step)
-    assert found["frequency [Hz]"] == pytest.approx(found["Euler-Bernoulli [Hz]"], rel=0.02)
-    assert found["damping ratio"] == pytest.approx(found["omega h / 2"], rel=0.1)
+    assert found['frequency [Hz]'] == pytest.approx(found['Euler-Bernoulli [Hz]'], rel=0.02)
+    assert found['damping ratio'] == pytest.approx(found['omega h / 2'], rel=0.1)
 
 
 def test_a_released_rod_only_loses_energy():
@@ -105,15 +126,30 @@ def test_a_released_rod_only_loses_energy():
 
 
 def tendon_rod(EA=None, relaxation=0.05, max_force=200.0, friction=0.0):
-    robot = RobotDescription(name="rod", length=LENGTH, radius=0.03, rings=(Ring(name="end", s=LENGTH),))
-    plant = PlantSettings(EI=EI, GJ=EI, EA=EA, mass_per_metre=MASS, relaxation=relaxation,
-                          tendons=({"end": LENGTH, "azimuth_deg": (0, 90, 180, 270), "radius": 0.02,
-                                    "max_force": max_force, "friction": friction},),
-                          profiles={"live": {"link_length": LENGTH / 40, "time_step": 0.005}})
+    robot = RobotDescription(
+        name='rod', length=LENGTH, radius=0.03, rings=(Ring(name='end', s=LENGTH),)
+    )
+    plant = PlantSettings(
+        EI=EI,
+        GJ=EI,
+        EA=EA,
+        mass_per_metre=MASS,
+        relaxation=relaxation,
+        tendons=(
+            {
+                'end': LENGTH,
+                'azimuth_deg': (0, 90, 180, 270),
+                'radius': 0.02,
+                'max_force': max_force,
+                'friction': friction,
+            },
+        ),
+        profiles={'live': {'link_length': LENGTH / 40, 'time_step': 0.005}},
+    )
     return plant, build_model(robot, plant, supported=True)
 
 
-@pytest.mark.parametrize("moment", [(0.05, 0.0), (0.0, 0.06), (-0.04, 0.03)])
+@pytest.mark.parametrize('moment', [(0.05, 0.0), (0.0, 0.06), (-0.04, 0.03)])
 def test_tensions_for_a_moment_bend_the_rod_by_that_moment(moment):
     """The tip turns by L / EI times the moment, about the moment's axis."""
     plant, model = tendon_rod()
@@ -121,10 +157,12 @@ def test_tensions_for_a_moment_bend_the_rod_by_that_moment(moment):
     data.ctrl[:] = plant.tension_for_moments(np.array([moment]), pretension=0.5)
     settle(model, data, rest_speed=1e-6)
     mujoco.mj_forward(model, data)
-    quat = data.body("node40").xquat
+    quat = data.body('node40').xquat
     turn = np.zeros(3)
     mujoco.mju_quat2Vel(turn, quat, 1.0)
-    np.testing.assert_allclose(turn, [0.0, moment[0] * LENGTH / EI, moment[1] * LENGTH / EI], atol=0.01)
+    np.testing.assert_allclose(
+        turn, [0.0, moment[0] * LENGTH / EI, moment[1] * LENGTH / EI], atol=0.01
+    )
 
 
 def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
@@ -134,7 +172,9 @@ def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
     data.ctrl[:] = 2.0
     settle(model, data, rest_speed=1e-6)
     mujoco.mj_forward(model, data)
-    assert LENGTH - data.body("node40").xpos[0] == pytest.approx(8.0 * LENGTH / stiffness, rel=1e-3)
+    assert LENGTH - data.body('node40').xpos[0] == pytest.approx(
+        8.0 * LENGTH / stiffness, rel=1e-3
+    )
     np.testing.assert_allclose(data.ten_length, LENGTH * (1.0 - 8.0 / stiffness), rtol=1e-3)
 
 
@@ -149,7 +189,7 @@ def test_tendon_friction_leaves_a_hysteresis():
         data.time = 0.0
         settle(model, data, rest_speed=1e-3)
         mujoco.mj_forward(model, data)
-        R = data.body("node40").xmat.reshape(3, 3)
+        R = data.body('node40').xmat.reshape(3, 3)
         bends.append(np.arctan2(R[1, 0], R[0, 0]))
     up, _, down = bends
     per_newton = plant.tendons[0].radius * LENGTH / EI
@@ -159,22 +199,26 @@ def test_tendon_friction_leaves_a_hysteresis():
 @given(arrays(float, (3, 2), elements=st.floats(-2.0, 2.0)), st.floats(0.0, 20.0))
 def test_tensions_add_up_to_the_moments_wanted_in_every_stretch(moments, pretension):
     """A tension F at (r_y, r_z) bends every stretch up to its end by F (-r_z, r_y)."""
-    plant = load_plant("engine")
+    plant = load_plant('engine')
     tension = plant.tension_for_moments(moments, pretension)
     ends = np.repeat([group.end for group in plant.tendons], 3)
     angle = np.radians(np.concatenate([group.azimuth_deg for group in plant.tendons]))
     arms = plant.tendons[0].radius * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
     for stretch, group in enumerate(plant.tendons):
         reach = ends >= group.end
-        np.testing.assert_allclose((tension[reach, None] * arms[reach]).sum(axis=0), moments[stretch], atol=1e-9)
+        np.testing.assert_allclose(
+            (tension[reach, None] * arms[reach]).sum(axis=0), moments[stretch], atol=1e-9
+        )
 
 
 def test_tensions_keep_the_pretension_and_a_moment_out_of_reach_is_refused():
-    plant = load_plant("engine")
+    plant = load_plant('engine')
     moments = np.random.default_rng(1).normal(0.0, 1.5, (200, 3, 2))
     tension = plant.tension_for_moments(moments, pretension=3.0)
     assert tension.shape == (200, 9) and tension.min() >= 3.0
-    with pytest.raises(ValueError, match=r"tendon3_\d would have to pull \d+ N, its limit is 600 N"):
+    with pytest.raises(
+        ValueError, match=r'tendon3_\d would have to pull \d+ N, its limit is 600 N'
+    ):
         plant.tension_for_moments(np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 30.0]]))
 
 
@@ -182,34 +226,41 @@ def test_a_diverging_simulation_stops_with_the_joint_and_what_to_change():
     _, model = tendon_rod(relaxation=0.0, max_force=1e7)
     data = mujoco.MjData(model)
     data.ctrl[:] = [1e7, 0.0, 0.0, 0.0]
-    with pytest.raises(SimulationDiverged, match=r"diverged at .* joint '(bend|stretch)\d+'.*time_step"):
+    with pytest.raises(
+        SimulationDiverged, match=r"diverged at .* joint '(bend|stretch)\d+'.*time_step"
+    ):
         for _ in range(2000):
             advance(model, data)
 
 
 def test_a_robot_that_never_rests_is_refused(monkeypatch):
-    monkeypatch.setattr(rod_model, "SETTLE_LIMIT", 0.2)
+    monkeypatch.setattr(rod_model, 'SETTLE_LIMIT', 0.2)
     model = uniform_rod(10, LENGTH, EI, MASS)
-    with pytest.raises(SimulationDiverged, match="did not come to rest"):
+    with pytest.raises(SimulationDiverged, match='did not come to rest'):
         settle(model, mujoco.MjData(model))
 
 
 def test_an_unstable_time_step_is_refused_before_the_start():
-    plant = load_plant("engine").model_copy(update={"carriage_stiffness": 1e8})
+    plant = load_plant('engine').model_copy(update={'carriage_stiffness': 1e8})
     from continuum_loc.robot import load_robot
 
-    with pytest.raises(SettingsError, match=r"time_step 0.005 s is too long .* use at most"):
-        build_model(load_robot("engine"), plant)
+    with pytest.raises(SettingsError, match=r'time_step 0.005 s is too long .* use at most'):
+        build_model(load_robot('engine'), plant)
 
 
-@pytest.mark.parametrize("name", ["engine", "soft_arm", "hall_arm"])
+@pytest.mark.parametrize('name', ['engine', 'soft_arm', 'hall_arm'])
 def test_every_ring_and_module_end_is_a_node(name):
     from continuum_loc.robot import load_robot
 
     robot, plant = load_robot(name), load_plant(name)
     for profile in plant.profiles.values():
         nodes = node_arclengths(robot, plant, profile.link_length)
-        wanted = [0.0, robot.length, *robot.ring_arclengths, *(group.end for group in plant.tendons)]
+        wanted = [
+            0.0,
+            robot.length,
+            *robot.ring_arclengths,
+            *(group.end for group in plant.tendons),
+        ]
         assert np.abs(nodes[:, None] - wanted).min(axis=0).max() < 1e-9
         assert np.all(np.diff(nodes) > 0) and np.diff(nodes).max() < 1.5 * profile.link_length
 
@@ -217,23 +268,30 @@ def test_every_ring_and_module_end_is_a_node(name):
 def test_the_full_engine_profile_is_the_papers():
     from continuum_loc.robot import load_robot
 
-    plant = load_plant("engine")
-    nodes = node_arclengths(load_robot("engine"), plant, plant.profile("full").link_length)
+    plant = load_plant('engine')
+    nodes = node_arclengths(load_robot('engine'), plant, plant.profile('full').link_length)
     assert len(nodes) == 151
     np.testing.assert_allclose(np.diff(nodes), 0.01, atol=1e-9)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"GJ": 4.0}, "GJ = 4.0 must equal EI"), ({"EI": -1.0}, "EI"), ({"stifness": 1.0}, "unknown key 'stifness'"),
-    ({"profiles": {"live": {"link_length": 0.03, "time_step": 0.5}}}, "time_step"),
-])
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'GJ': 4.0}, 'GJ = 4.0 must equal EI'),
+        ({'EI': -1.0}, 'EI'),
+        ({'stifness': 1.0}, "unknown key 'stifness'"),
+        ({'profiles': {'live': {'link_length': 0.03, 'time_step': 0.5}}}, 'time_step'),
+    ],
+)
 def test_bad_plants_are_refused_with_their_place(change, message):
     with pytest.raises(SettingsError, match=message):
-        parse_settings(PlantSettings, {**load_plant("engine").model_dump(), **change}, where="plant.yaml")
+        parse_settings(
+            PlantSettings, {**load_plant('engine').model_dump(), **change}, where='plant.yaml'
+        )
 
 
 def test_unknown_plants_and_profiles_name_the_valid_ones():
-    with pytest.raises(SettingsError, match="engine, hall_arm, soft_arm"):
-        load_plant("enginee")
-    with pytest.raises(SettingsError, match="full, live"):
-        load_plant("engine").profile("fast")
+    with pytest.raises(SettingsError, match='engine, hall_arm, soft_arm'):
+        load_plant('enginee')
+    with pytest.raises(SettingsError, match='full, live'):
+        load_plant('engine').profile('fast')

@@ -1,22 +1,23 @@
 """Errors against evo's, consistency against the distributions it is defined by, tracks against their files."""
 
-import numpy as np
-import pytest
+from continuum_loc import lie
+from continuum_loc.evaluation.metrics import drift_band, Errors, errors, nees, summarise
+from continuum_loc.evaluation.tracks import associate, load_tum, save_tum, Track, TrackError
+from continuum_loc.measurements import NANOSECONDS, TruthSample
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 
-from continuum_loc import lie
-from continuum_loc.evaluation.metrics import Errors, drift_band, errors, nees, summarise
-from continuum_loc.evaluation.tracks import Track, TrackError, associate, load_tum, save_tum
-from continuum_loc.measurements import NANOSECONDS, TruthSample
-
-NAMES = ("base", "ring1", "ring2")
+NAMES = ('base', 'ring1', 'ring2')
 START = 1_700_000_000 * NANOSECONDS + 123_456_789
 
 
 def smooth_truth(count: int = 200, period: float = 0.01) -> Track:
     """A body whose rings turn and travel at constant body velocities, so that geodesics are exact."""
-    twists = np.array([[0, 0, 0, 0, 0, 0], [0.1, 0.02, 0, 0, 0.3, 0.1], [0.2, -0.1, 0.05, 0.2, 0.5, -0.7]], float)
+    twists = np.array(
+        [[0, 0, 0, 0, 0, 0], [0.1, 0.02, 0, 0, 0.3, 0.1], [0.2, -0.1, 0.05, 0.2, 0.5, -0.7]], float
+    )
     times = np.arange(count) * period
     T_map_ring = lie.exp(times[:, None, None] * twists)
     T_map_ring[..., 0, 3] += np.array([0.0, 0.3, 0.6])
@@ -25,13 +26,21 @@ def smooth_truth(count: int = 200, period: float = 0.01) -> Track:
 
 def noisy(truth: Track, covariance: np.ndarray, seed: int) -> Track:
     """`truth` perturbed so that xi = Log(T_est^-1 T_true) is N(0, covariance)."""
-    draw = np.random.default_rng(seed).multivariate_normal(np.zeros(6), covariance, truth.T_map_ring.shape[:2])
+    draw = np.random.default_rng(seed).multivariate_normal(
+        np.zeros(6), covariance, truth.T_map_ring.shape[:2]
+    )
     T_est = truth.T_map_ring @ lie.exp(-draw)
-    return Track(truth.stamps, truth.names, T_est, np.broadcast_to(covariance, (*T_est.shape[:2], 6, 6)))
+    return Track(
+        truth.stamps, truth.names, T_est, np.broadcast_to(covariance, (*T_est.shape[:2], 6, 6))
+    )
 
 
 def random_covariance(seed: int) -> np.ndarray:
-    root = np.random.default_rng(seed).normal(size=(6, 6)) * np.array([5, 5, 5, 20, 20, 20])[:, None] * 1e-3
+    root = (
+        np.random.default_rng(seed).normal(size=(6, 6))
+        * np.array([5, 5, 5, 20, 20, 20])[:, None]
+        * 1e-3
+    )
     return root @ root.T + 1e-8 * np.eye(6)
 
 
@@ -42,19 +51,24 @@ def test_errors_agree_with_evo(tmp_path):
 
     truth = smooth_truth()
     estimate = noisy(truth, random_covariance(0), seed=1)
-    save_tum(truth, tmp_path, "truth")
-    save_tum(estimate, tmp_path, "estimate")
-    ours = summarise(errors(estimate, truth))["rings"]["ring2"]
-    pair = associate_trajectories(read_tum_trajectory_file(tmp_path / "truth_ring2.tum"),
-                                  read_tum_trajectory_file(tmp_path / "estimate_ring2.tum"), max_diff=1e-4)
-    relations = {"translation": evo_metrics.PoseRelation.translation_part,
-                 "rotation": evo_metrics.PoseRelation.rotation_angle_deg}
-    for kind, unit in (("translation", "m"), ("rotation", "deg")):
+    save_tum(truth, tmp_path, 'truth')
+    save_tum(estimate, tmp_path, 'estimate')
+    ours = summarise(errors(estimate, truth))['rings']['ring2']
+    pair = associate_trajectories(
+        read_tum_trajectory_file(tmp_path / 'truth_ring2.tum'),
+        read_tum_trajectory_file(tmp_path / 'estimate_ring2.tum'),
+        max_diff=1e-4,
+    )
+    relations = {
+        'translation': evo_metrics.PoseRelation.translation_part,
+        'rotation': evo_metrics.PoseRelation.rotation_angle_deg,
+    }
+    for kind, unit in (('translation', 'm'), ('rotation', 'deg')):
         ape = evo_metrics.APE(relations[kind])
         ape.process_data(pair)
         theirs = ape.get_all_statistics()
-        assert ours[f"{kind}_mae_{unit}"] == pytest.approx(theirs["mean"], abs=1e-6)
-        assert ours[f"{kind}_rmse_{unit}"] == pytest.approx(theirs["rmse"], abs=1e-6)
+        assert ours[f'{kind}_mae_{unit}'] == pytest.approx(theirs['mean'], abs=1e-6)
+        assert ours[f'{kind}_rmse_{unit}'] == pytest.approx(theirs['rmse'], abs=1e-6)
 
 
 def test_known_offset_is_reported_exactly():
@@ -64,20 +78,24 @@ def test_known_offset_is_reported_exactly():
     moved = truth.T_map_ring.copy()
     moved[:, 2] = moved[:, 2] @ shift
     figures = summarise(errors(Track(truth.stamps, NAMES, moved), truth))
-    assert figures["rings"]["ring2"]["translation_mae_m"] == pytest.approx(0.005, abs=1e-12)
-    assert figures["rings"]["ring2"]["rotation_rmse_deg"] == pytest.approx(2.0, abs=1e-9)
-    assert figures["rings"]["ring1"]["translation_mae_m"] == pytest.approx(0.0, abs=1e-12)
-    assert figures["translation_mae_m"] == pytest.approx(0.0025, abs=1e-12)  # over both rings, without the base
-    assert np.isnan(figures["nees_per_dof"])  # no covariance was given, and none is invented
+    assert figures['rings']['ring2']['translation_mae_m'] == pytest.approx(0.005, abs=1e-12)
+    assert figures['rings']['ring2']['rotation_rmse_deg'] == pytest.approx(2.0, abs=1e-9)
+    assert figures['rings']['ring1']['translation_mae_m'] == pytest.approx(0.0, abs=1e-12)
+    assert figures['translation_mae_m'] == pytest.approx(
+        0.0025, abs=1e-12
+    )  # over both rings, without the base
+    assert np.isnan(figures['nees_per_dof'])  # no covariance was given, and none is invented
 
 
 def test_honest_covariance_gives_unit_nees_and_95_percent_coverage():
     covariance = random_covariance(3)
-    figures = summarise(errors(noisy(smooth_truth(4000, 0.001), covariance, seed=4), smooth_truth(4000, 0.001)))
-    # 8000 poses: NEES/6 has mean 1, deviation sqrt(2/6/8000) = 0.0065; coverage 0.95 +- 0.0024. Bounds at 5 sigma,
-    # false alarm below 1e-6.
-    assert figures["nees_per_dof"] == pytest.approx(1.0, abs=0.033)
-    assert figures["coverage_95"] == pytest.approx(0.95, abs=0.0125)
+    figures = summarise(
+        errors(noisy(smooth_truth(4000, 0.001), covariance, seed=4), smooth_truth(4000, 0.001))
+    )
+    # 8000 poses: NEES/6 has mean 1, deviation sqrt(2/6/8000) = 0.0065; coverage 0.95 +- 0.0024.
+    # Bounds at 5 sigma, false alarm below 1e-6.
+    assert figures['nees_per_dof'] == pytest.approx(1.0, abs=0.033)
+    assert figures['coverage_95'] == pytest.approx(0.95, abs=0.0125)
 
 
 def test_overconfident_covariance_is_told():
@@ -85,8 +103,8 @@ def test_overconfident_covariance_is_told():
     estimate = noisy(truth, covariance, seed=6)
     proud = Track(estimate.stamps, NAMES, estimate.T_map_ring, estimate.covariance / 9.0)
     figures = summarise(errors(proud, truth))
-    assert figures["nees_per_dof"] == pytest.approx(9.0, rel=0.1)
-    assert figures["coverage_95"] < 0.35  # P(chi2_6 <= 12.59 / 9) = 0.034
+    assert figures['nees_per_dof'] == pytest.approx(9.0, rel=0.1)
+    assert figures['coverage_95'] < 0.35  # P(chi2_6 <= 12.59 / 9) = 0.034
 
 
 def test_nees_of_an_indefinite_covariance_is_nan_and_counts_as_not_covered():
@@ -97,9 +115,16 @@ def test_nees_of_an_indefinite_covariance_is_nan_and_counts_as_not_covered():
     assert values[0] == pytest.approx(6.0)
     assert np.isnan(values[1])
     blank = np.zeros((1, 2, 6))
-    found = Errors(np.array([0]), ("base", "ring1"), np.zeros((1, 2)), np.zeros((1, 2)), blank, blank,
-                   np.array([[0.0, np.nan]]))
-    assert summarise(found)["invalid_covariances"] == 1
+    found = Errors(
+        np.array([0]),
+        ('base', 'ring1'),
+        np.zeros((1, 2)),
+        np.zeros((1, 2)),
+        blank,
+        blank,
+        np.array([[0.0, np.nan]]),
+    )
+    assert summarise(found)['invalid_covariances'] == 1
 
 
 def test_three_sigma_band_holds_the_error_as_often_as_a_gaussian_does():
@@ -124,47 +149,54 @@ def test_instants_without_truth_are_left_out():
     gap = truth.select((np.arange(100) < 20) | (np.arange(100) >= 60))
     late = Track(truth.stamps + 5 * NANOSECONDS, NAMES, truth.T_map_ring)
     assert len(associate(late, truth)[0]) == 0
-    assert len(associate(truth, gap, longest_gap=0.2)[0]) == 60  # the 40 samples inside the gap of 0.41 s go
-    assert np.isnan(summarise(errors(late, truth))["translation_mae_m"])
+    assert (
+        len(associate(truth, gap, longest_gap=0.2)[0]) == 60
+    )  # the 40 samples inside the gap of 0.41 s go
+    assert np.isnan(summarise(errors(late, truth))['translation_mae_m'])
 
 
 def test_bodies_with_other_rings_are_refused():
     truth = smooth_truth()
-    with pytest.raises(TrackError, match="different bodies.*tip"):
-        associate(Track(truth.stamps, ("base", "ring1", "tip"), truth.T_map_ring), truth)
+    with pytest.raises(TrackError, match='different bodies.*tip'):
+        associate(Track(truth.stamps, ('base', 'ring1', 'tip'), truth.T_map_ring), truth)
 
 
 def test_stamps_must_increase_and_shapes_must_match():
     truth = smooth_truth(3)
-    with pytest.raises(TrackError, match="increase"):
+    with pytest.raises(TrackError, match='increase'):
         Track(truth.stamps[::-1], NAMES, truth.T_map_ring)
-    with pytest.raises(TrackError, match="T_map_ring has shape"):
+    with pytest.raises(TrackError, match='T_map_ring has shape'):
         Track(truth.stamps, NAMES[:2], truth.T_map_ring)
 
 
 def test_truth_samples_are_put_in_order():
-    samples = [TruthSample(stamp, np.tile(np.eye(4) * 1.0, (3, 1, 1))) for stamp in (30, 10, 20, 10)]
+    samples = [
+        TruthSample(stamp, np.tile(np.eye(4) * 1.0, (3, 1, 1))) for stamp in (30, 10, 20, 10)
+    ]
     assert Track.from_truth(samples, NAMES[1:]).stamps.tolist() == [10, 20, 30]
-    with pytest.raises(TrackError, match="holds 3 poses; this robot has 2: base, ring1"):
+    with pytest.raises(TrackError, match='holds 3 poses; this robot has 2: base, ring1'):
         Track.from_truth(samples, NAMES[1:2])
 
 
-@given(st.lists(st.integers(0, 4 * 10**18), min_size=1, max_size=5, unique=True), st.integers(0, 2**32 - 1))
+@given(
+    st.lists(st.integers(0, 4 * 10**18), min_size=1, max_size=5, unique=True),
+    st.integers(0, 2**32 - 1),
+)
 @settings(max_examples=40, deadline=None)
 def test_tum_files_keep_every_nanosecond_and_pose(tmp_path_factory, stamps, seed):
-    folder = tmp_path_factory.mktemp("tum")
+    folder = tmp_path_factory.mktemp('tum')
     poses = lie.exp(np.random.default_rng(seed).normal(size=(len(stamps), 3, 6)))
     track = Track(np.array(sorted(stamps), np.int64), NAMES, poses)
-    save_tum(track, folder, "estimate")
-    back = load_tum(folder, "estimate", NAMES)
+    save_tum(track, folder, 'estimate')
+    back = load_tum(folder, 'estimate', NAMES)
     np.testing.assert_array_equal(back.stamps, track.stamps)
     np.testing.assert_allclose(back.T_map_ring, track.T_map_ring, atol=1e-10)
 
 
 def test_a_broken_tum_file_is_named(tmp_path):
     for name in NAMES:
-        (tmp_path / f"truth_{name}.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 1\n")
-    with pytest.raises(TrackError, match=r"truth_base\.tum.*8 numbers"):
-        load_tum(tmp_path, "truth", NAMES)
-    with pytest.raises(TrackError, match=r"nowhere_base\.tum: cannot be read"):
-        load_tum(tmp_path, "nowhere", NAMES)
+        (tmp_path / f'truth_{name}.tum').write_text('1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 1\n')
+    with pytest.raises(TrackError, match=r'truth_base\.tum.*8 numbers'):
+        load_tum(tmp_path, 'truth', NAMES)
+    with pytest.raises(TrackError, match=r'nowhere_base\.tum: cannot be read'):
+        load_tum(tmp_path, 'nowhere', NAMES)

@@ -1,17 +1,24 @@
 """Between messages and the estimator: the queue's order of sacrifice, rules for stamps, and 10,000 bad messages."""
 
-import threading
-import time
 from collections import Counter
 from dataclasses import replace
+import threading
+import time
 
 import numpy as np
 import pytest
 
-pytest.importorskip("numba")
+pytest.importorskip('numba')
 
-from continuum_loc.measurements import EncoderSample, ImuSample, StrainSample, TofFrame, TrackedPose, nanoseconds
-from continuum_loc.nodes.intake import SACRIFICE, Inbox, Intake, StampGate
+from continuum_loc.measurements import (
+    EncoderSample,
+    ImuSample,
+    nanoseconds,
+    StrainSample,
+    TofFrame,
+    TrackedPose,
+)
+from continuum_loc.nodes.intake import Inbox, Intake, SACRIFICE, StampGate
 from continuum_loc.nodes.pacing import Paced
 from continuum_loc.nodes.settings import IntakeSettings
 from continuum_loc.nodes.warm_up import rest_samples
@@ -28,23 +35,34 @@ START = 1000 * SECOND
 
 def test_topics_torn_apart_by_a_backlog_are_merged_again_by_stamp():
     """Reception empties one topic after the other; what leaves is in the order of the stamps, unless one lies."""
-    samples = [(_topic(sample), sample) for sample in rest_samples(load_robot("engine"), 1.0, START)]
+    samples = [
+        (_topic(sample), sample) for sample in rest_samples(load_robot('engine'), 1.0, START)
+    ]
     inbox = Inbox(IntakeSettings())
     for topic in SACRIFICE:
         for name, sample in samples:
             if name == topic:
-                inbox.put(topic, topic_spec(topic).encode(bag_messages(), sample), START + 2 * SECOND)
-    lying = topic_spec("strain").encode(bag_messages(), StrainSample(START + 10**6 * SECOND, *np.ones((3, 1))))
-    inbox.put("strain", lying, START + 2 * SECOND)
+                inbox.put(
+                    topic, topic_spec(topic).encode(bag_messages(), sample), START + 2 * SECOND
+                )
+    lying = topic_spec('strain').encode(
+        bag_messages(), StrainSample(START + 10**6 * SECOND, *np.ones((3, 1)))
+    )
+    inbox.put('strain', lying, START + 2 * SECOND)
     left = list(iter(lambda: inbox.take(0.0), None))
-    stamps = [topic_spec(item.topic).decode(item.message, 1, item.topic).stamp for item in left[:-1]]
+    stamps = [
+        topic_spec(item.topic).decode(item.message, 1, item.topic).stamp for item in left[:-1]
+    ]
     assert len(left) == len(samples) + 1 and left[-1].message is lying
     assert (np.diff(stamps) >= -1000).all()  # strain's stamp is a float of seconds
 
 
 def test_messages_leave_in_the_order_of_arrival_across_topics():
     inbox = Inbox(IntakeSettings())
-    sent = [(topic, number) for number, topic in enumerate(["imu/data_raw", "tof/points", "strain"] * 20)]
+    sent = [
+        (topic, number)
+        for number, topic in enumerate(['imu/data_raw', 'tof/points', 'strain'] * 20)
+    ]
     for topic, number in sent:
         inbox.put(topic, number, 0)
     got = [inbox.take(0.0) for _ in sent]
@@ -57,28 +75,28 @@ def test_an_overloaded_queue_gives_up_in_its_defined_order():
     inbox = Inbox(IntakeSettings(queue_capacity=10_000, max_backlog=1e9))
     for number in range(100):
         for kind in SACRIFICE:
-            inbox.put("tracker/em1" if kind == "tracker/" else kind, number, 0)
+            inbox.put('tracker/em1' if kind == 'tracker/' else kind, number, 0)
     for capacity in (550, 450, 350, 250, 150, 100):
         inbox.settings = IntakeSettings(queue_capacity=capacity, max_backlog=1e9)
-        inbox.put("imu/data_raw", 100, 0)
+        inbox.put('imu/data_raw', 100, 0)
         for index, kind in enumerate(SACRIFICE[:-1]):
-            given_up = 600 + inbox.received["imu/data_raw"] - 100 - capacity - 100 * index
+            given_up = 600 + inbox.received['imu/data_raw'] - 100 - capacity - 100 * index
             assert inbox.dropped[kind] == np.clip(given_up, 0, 100), (capacity, kind)
     oldest = inbox.take(0.0)
-    assert oldest.topic == "imu/data_raw"
+    assert oldest.topic == 'imu/data_raw'
 
 
 def test_old_tof_frames_are_dropped_and_counted_while_all_else_is_kept():
     inbox = Inbox(IntakeSettings(max_backlog=0.05))
     for number in range(10):
-        inbox.put("tof/points", number, 0)
-        inbox.put("imu/data_raw", number, 0)
+        inbox.put('tof/points', number, 0)
+        inbox.put('imu/data_raw', number, 0)
         time.sleep(0.02)
-    kept = [item for item in iter(lambda: inbox.take(0.0), None)]
-    frames = [item.message for item in kept if item.topic == "tof/points"]
-    assert frames == list(range(10))[-len(frames):] and 1 <= len(frames) <= 4
-    assert inbox.dropped == {"tof/points": 10 - len(frames)}
-    assert [item.message for item in kept if item.topic == "imu/data_raw"] == list(range(10))
+    kept = list(iter(lambda: inbox.take(0.0), None))
+    frames = [item.message for item in kept if item.topic == 'tof/points']
+    assert frames == list(range(10))[-len(frames) :] and 1 <= len(frames) <= 4
+    assert inbox.dropped == {'tof/points': 10 - len(frames)}
+    assert [item.message for item in kept if item.topic == 'imu/data_raw'] == list(range(10))
 
 
 def test_nothing_is_lost_between_two_threads():
@@ -94,7 +112,7 @@ def test_nothing_is_lost_between_two_threads():
     worker = threading.Thread(target=work)
     worker.start()
     for number in range(20_000):
-        inbox.put("imu/data_raw", number, 0)
+        inbox.put('imu/data_raw', number, 0)
     worker.join(60.0)
     assert got == list(range(20_000))
 
@@ -105,22 +123,26 @@ def test_nothing_is_lost_between_two_threads():
 def test_zero_future_and_doubled_stamps_are_told_apart():
     gate = StampGate(IntakeSettings())
     now = START + SECOND
-    assert gate.judge(0, "a", now) == "zero stamp"
-    assert gate.judge(now + 2 * SECOND, "a", now) == "future stamp"
-    assert gate.judge(now + 2 * SECOND, "a", 0) is None  # a simulated clock that has not begun judges nobody
+    assert gate.judge(0, 'a', now) == 'zero stamp'
+    assert gate.judge(now + 2 * SECOND, 'a', now) == 'future stamp'
+    assert (
+        gate.judge(now + 2 * SECOND, 'a', 0) is None
+    )  # a simulated clock that has not begun judges nobody
     gate.reset()
-    assert gate.judge(START, "a", now) is None
-    assert gate.judge(START, "a", now) == "duplicate"
-    assert gate.judge(START, "b", now) is None
-    assert gate.judge(START - SECOND // 10, "b", now) is None  # late, but within what the window may use
+    assert gate.judge(START, 'a', now) is None
+    assert gate.judge(START, 'a', now) == 'duplicate'
+    assert gate.judge(START, 'b', now) is None
+    assert (
+        gate.judge(START - SECOND // 10, 'b', now) is None
+    )  # late, but within what the window may use
 
 
-@pytest.mark.parametrize(("leap", "restarts"), [(-100 * SECOND, 1), (+100 * SECOND, 0)])
+@pytest.mark.parametrize(('leap', 'restarts'), [(-100 * SECOND, 1), (+100 * SECOND, 0)])
 def test_a_leap_is_believed_only_when_several_agree(leap, restarts):
     gate = StampGate(IntakeSettings(jump_confirmations=10))
-    assert gate.judge(START, "a", 0) is None
-    verdicts = [gate.judge(START + leap + k * SECOND // 100, "a", 0) for k in range(12)]
-    assert verdicts == ["leap"] * 9 + [None] * 3
+    assert gate.judge(START, 'a', 0) is None
+    verdicts = [gate.judge(START + leap + k * SECOND // 100, 'a', 0) for k in range(12)]
+    assert verdicts == ['leap'] * 9 + [None] * 3
     assert gate.restarts == restarts
 
 
@@ -130,86 +152,94 @@ def test_lone_wild_stamps_never_move_the_clock():
     accepted = 0
     for k in range(2000):
         if k % 3 == 0:
-            gate.judge(int(rng.integers(1, 10**6) * SECOND), "a", 0)  # the very first has to be believed
+            gate.judge(
+                int(rng.integers(1, 10**6) * SECOND), 'a', 0
+            )  # the very first has to be believed
         else:
-            accepted += gate.judge(START + k * SECOND // 100, "a", 0) is None
+            accepted += gate.judge(START + k * SECOND // 100, 'a', 0) is None
     assert accepted >= 1300 and gate.restarts == 1
     assert abs(gate.newest - (START + 1999 * SECOND // 100)) < SECOND
 
 
-# ---------------------------------------------------------------- 10,000 messages of which most are bad
+# ----------------------------------------------------------- 10,000 messages of which most are bad
 
 
 def _bad(rng, kind, topic, item):
     """A message of `item` spoiled in one way, or raw bytes."""
     make = bag_messages()
     spec = topic_spec(topic)
-    if kind in ("zero stamp", "future stamp", "unknown frame"):
-        changes = {"zero stamp": {"stamp": 0}, "future stamp": {"stamp": item.stamp + 10**12},
-                   "unknown frame": {"sensor": f"stranger{rng.integers(5)}"}}[kind]
+    if kind in ('zero stamp', 'future stamp', 'unknown frame'):
+        changes = {
+            'zero stamp': {'stamp': 0},
+            'future stamp': {'stamp': item.stamp + 10**12},
+            'unknown frame': {'sensor': f'stranger{rng.integers(5)}'},
+        }[kind]
         return spec.encode(make, replace(item, **changes))
     message = spec.encode(make, item)
-    if kind == "nan":
+    if kind == 'nan':
         _spoil(message, topic)
-    if kind == "size":
+    if kind == 'size':
         _shorten(message, topic)
-    if kind == "type":
+    if kind == 'type':
         message.fields[0].datatype = int(rng.integers(9, 255))
-    if kind == "endianness":
+    if kind == 'endianness':
         message.is_bigendian = True
-    if kind == "empty":
+    if kind == 'empty':
         _emptied(message, topic)
     return message
 
 
 def _spoil(message, topic):
-    if topic == "tof/points":
+    if topic == 'tof/points':
         data = message.data.copy()
-        data.view("<f4").reshape(-1, 6)[:, :4] = np.nan
+        data.view('<f4').reshape(-1, 6)[:, :4] = np.nan
         message.data = data
-    elif topic == "imu/data_raw":
+    elif topic == 'imu/data_raw':
         message.angular_velocity.x = np.nan
     else:
         message.data = np.full_like(message.data, np.nan)
 
 
 def _shorten(message, topic):
-    if topic == "tof/points":
+    if topic == 'tof/points':
         message.data = message.data[:-5]
-    elif topic == "strain":
+    elif topic == 'strain':
         message.data = message.data[:-1]
     else:
         message.position = message.position[:-1] if len(message.position) > 1 else np.zeros(3)
 
 
 def _emptied(message, topic):
-    if topic == "tof/points":
+    if topic == 'tof/points':
         message.width, message.data = 0, message.data[:0]
-    elif topic == "strain":
+    elif topic == 'strain':
         message.data = message.data[:0]
     else:
         message.name, message.position, message.effort = [], np.empty(0), np.empty(0)
 
 
 CLASSES = {  # class of spoiled messages -> topics, and what the intake calls it (None: a valid message of its kind)
-    "zero stamp": (("tof/points", "imu/data_raw", "joint_states"), {"zero stamp"}),
-    "future stamp": (("tof/points", "imu/data_raw", "joint_states"), {"future stamp"}),
-    "unknown frame": (("tof/points", "imu/data_raw"), {"unknown frame"}),
-    "duplicate": (("tof/points", "imu/data_raw", "joint_states"), {"duplicate"}),
-    "size": (("tof/points", "strain", "joint_states"), {"size"}),
-    "type": (("tof/points",), {"type"}),
-    "endianness": (("tof/points",), {"range", "value"}),
-    "nan": (("imu/data_raw", "strain"), {"value"}),
-    "empty": (("tof/points", "strain", "joint_states"), {"empty", "size"}),
-    "bytes": (("tof/points", "imu/data_raw", "strain", "joint_states"), {"bytes"}),
+    'zero stamp': (('tof/points', 'imu/data_raw', 'joint_states'), {'zero stamp'}),
+    'future stamp': (('tof/points', 'imu/data_raw', 'joint_states'), {'future stamp'}),
+    'unknown frame': (('tof/points', 'imu/data_raw'), {'unknown frame'}),
+    'duplicate': (('tof/points', 'imu/data_raw', 'joint_states'), {'duplicate'}),
+    'size': (('tof/points', 'strain', 'joint_states'), {'size'}),
+    'type': (('tof/points',), {'type'}),
+    'endianness': (('tof/points',), {'range', 'value'}),
+    'nan': (('imu/data_raw', 'strain'), {'value'}),
+    'empty': (('tof/points', 'strain', 'joint_states'), {'empty', 'size'}),
+    'bytes': (('tof/points', 'imu/data_raw', 'strain', 'joint_states'), {'bytes'}),
 }
 
 
 def test_ten_thousand_bad_messages_are_refused_by_class_and_leave_the_good_ones_unharmed():
-    """Every bad message is refused under its class, each class is reported once, and what gets through is exactly
-    what gets through without any bad message: so the estimates are unharmed, whatever the filter."""
+    """
+    Every bad message is refused under its class, each class is reported once, and what gets
+    through is exactly
+    what gets through without any bad message: so the estimates are unharmed, whatever the filter.
+    """
     rng = np.random.default_rng(7)
-    robot = load_robot("engine")
+    robot = load_robot('engine')
     good = [(_topic(sample), sample) for sample in rest_samples(robot, 4.0, START)]
     reports: list[tuple[str, str]] = []
     intake = Intake(robot, IntakeSettings(), lambda kind, text: reports.append((kind, text)))
@@ -231,7 +261,11 @@ def test_ten_thousand_bad_messages_are_refused_by_class_and_leave_the_good_ones_
                 continue
             before = Counter(intake.refused)
             assert _offer(intake, rng, kind, bad_topic, victim, now) is None, (kind, bad_topic)
-            assert set(intake.refused - before) <= names, (kind, bad_topic, intake.refused - before)
+            assert set(intake.refused - before) <= names, (
+                kind,
+                bad_topic,
+                intake.refused - before,
+            )
             expected[kind] += 1
     assert sum(expected.values()) >= 10_000 * 0.9 and set(expected) == set(CLASSES)
     assert sum(intake.refused.values()) == sum(expected.values())
@@ -241,9 +275,9 @@ def test_ten_thousand_bad_messages_are_refused_by_class_and_leave_the_good_ones_
 
 
 def _offer(intake, rng, kind, topic, victim, now):
-    if kind == "duplicate":
+    if kind == 'duplicate':
         return intake.accept(topic, topic_spec(topic).encode(bag_messages(), victim), now, now)
-    if kind != "bytes":
+    if kind != 'bytes':
         return intake.accept(topic, _bad(rng, kind, topic, victim), now, now)
     from msg_tools.errors import ConvertError
 
@@ -252,14 +286,19 @@ def _offer(intake, rng, kind, topic, victim, now):
     try:
         deserialize(data[: int(rng.integers(5, max(len(data) // 2, 6)))], spec.type)
     except Exception as error:  # on a graph the middleware refuses such bytes before we see them
-        intake.refuse("bytes", str(ConvertError("bytes", f"{topic}: {error}")))
+        intake.refuse('bytes', str(ConvertError('bytes', f'{topic}: {error}')))
         return None
-    raise AssertionError("half a message was taken for a whole one")
+    raise AssertionError('half a message was taken for a whole one')
 
 
 def _topic(sample):
-    return {TofFrame: "tof/points", ImuSample: "imu/data_raw", StrainSample: "strain", EncoderSample: "joint_states",
-            TrackedPose: "tracker/em1"}[type(sample)]
+    return {
+        TofFrame: 'tof/points',
+        ImuSample: 'imu/data_raw',
+        StrainSample: 'strain',
+        EncoderSample: 'joint_states',
+        TrackedPose: 'tracker/em1',
+    }[type(sample)]
 
 
 def _latest(samples, stamp):
@@ -279,8 +318,10 @@ def test_items_come_when_they_are_due_and_in_order():
     came: list[tuple[int, float]] = []
     paced = Paced(((stamp, None) for stamp in stamps), lookahead=0.05)
     begin: list[float] = []
-    paced.run(lambda stamp, item, delay: came.append((stamp, time.monotonic())),
-              lambda first: begin.append(time.monotonic()))
+    paced.run(
+        lambda stamp, item, delay: came.append((stamp, time.monotonic())),
+        lambda first: begin.append(time.monotonic()),
+    )
     assert [stamp for stamp, _ in came] == stamps
     early = [at - begin[0] - 0.05 - (stamp - stamps[0]) / SECOND for stamp, at in came]
     assert min(early) > -0.001  # never before its time; how late is a matter of the machine's load
@@ -303,9 +344,9 @@ def test_the_preparation_runs_no_farther_ahead_than_told():
 def test_an_error_in_the_preparation_reaches_the_one_who_delivers():
     def items():
         yield 1, None
-        raise RuntimeError("diverged")
+        raise RuntimeError('diverged')
 
-    with pytest.raises(RuntimeError, match="diverged"):
+    with pytest.raises(RuntimeError, match='diverged'):
         Paced(items(), 0.0).run(lambda *_: None)
 
 

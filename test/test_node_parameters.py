@@ -6,27 +6,26 @@ from pathlib import Path
 import pytest
 import yaml
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
-
-from node_graph import fresh_domain
-from rcl_interfaces.msg import ParameterType
-from rclpy.context import Context
-from rclpy.parameter import Parameter
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed')
 
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes import parameters
 from continuum_loc.nodes.runtime import PackageNode
 from continuum_loc.nodes.settings import EstimatorNodeSettings
-from continuum_loc.nodes.write_config import NODES, config_text
+from continuum_loc.nodes.write_config import config_text, NODES
 from continuum_loc.settings import SettingsError
+from node_graph import fresh_domain
+from rcl_interfaces.msg import ParameterType
+from rclpy.context import Context
+from rclpy.parameter import Parameter
 
-CONFIG = Path(__file__).resolve().parent.parent / "config"
+CONFIG = Path(__file__).resolve().parent.parent / 'config'
 
 
 @contextlib.contextmanager
-def node_of(defaults, *arguments, name="estimator"):
+def node_of(defaults, *arguments, name='estimator'):
     context = Context()
-    rclpy.init(context=context, domain_id=fresh_domain(), args=["--ros-args", *arguments])
+    rclpy.init(context=context, domain_id=fresh_domain(), args=['--ros-args', *arguments])
     node = None
     try:
         node = PackageNode(name, defaults, context=context)
@@ -37,11 +36,11 @@ def node_of(defaults, *arguments, name="estimator"):
         rclpy.try_shutdown(context=context)
 
 
-@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize('name', NODES)
 def test_every_parameter_has_a_description_a_type_and_its_default(name):
     with node_of(NODES[name], name=name) as node:
         assert node.settings == NODES[name]
-        names = [leaf for leaf, _, _ in parameters.leaves(NODES[name], "")]
+        names = [leaf for leaf, _, _ in parameters.leaves(NODES[name], '')]
         for descriptor in node.describe_parameters(names):
             assert descriptor.description, descriptor.name
             assert descriptor.type != ParameterType.PARAMETER_NOT_SET, descriptor.name
@@ -50,38 +49,59 @@ def test_every_parameter_has_a_description_a_type_and_its_default(name):
 def test_filter_settings_are_parameters_too_with_units_and_ranges():
     with node_of(EstimatorNodeSettings()) as node:
         preset = EstimatorSettings()
-        assert parameters.declare(node, preset, "filter.") == preset
-        gate, cosine = node.describe_parameters(["filter.tof.gate", "filter.tof.min_cosine"])
-        assert "[m]" in gate.description and gate.additional_constraints == "> 0"
+        assert parameters.declare(node, preset, 'filter.') == preset
+        gate, cosine = node.describe_parameters(['filter.tof.gate', 'filter.tof.min_cosine'])
+        assert '[m]' in gate.description and gate.additional_constraints == '> 0'
         bounds = cosine.floating_point_range[0]
         assert (bounds.from_value, bounds.to_value) == (0.0, 1.0)
 
 
 def test_values_given_at_the_start_are_taken_and_whole_numbers_serve_as_floats():
-    with node_of(EstimatorNodeSettings(), "-p", "lag_warning:=2", "-p", "robot:=soft_arm",
-                 "-p", "intake.queue_capacity:=500") as node:
+    with node_of(
+        EstimatorNodeSettings(),
+        '-p',
+        'lag_warning:=2',
+        '-p',
+        'robot:=soft_arm',
+        '-p',
+        'intake.queue_capacity:=500',
+    ) as node:
         assert node.settings.lag_warning == 2.0
-        assert node.settings.robot == "soft_arm" and node.settings.intake.queue_capacity == 500
+        assert node.settings.robot == 'soft_arm' and node.settings.intake.queue_capacity == 500
 
 
-@pytest.mark.parametrize(("argument", "text"), [
-    ("lag_warning:=-1.0", "lag_warning"), ("lag_warning:=text", "lag_warning"), ("lag_warning:=0.0", "lag_warning"),
-    ("intake.queue_capacity:=5", "intake.queue_capacity"), ("publish_tf:=7", "publish_tf")])
+@pytest.mark.parametrize(
+    ('argument', 'text'),
+    [
+        ('lag_warning:=-1.0', 'lag_warning'),
+        ('lag_warning:=text', 'lag_warning'),
+        ('lag_warning:=0.0', 'lag_warning'),
+        ('intake.queue_capacity:=5', 'intake.queue_capacity'),
+        ('publish_tf:=7', 'publish_tf'),
+    ],
+)
 def test_values_out_of_range_or_of_another_type_are_refused_by_name(argument, text):
-    with pytest.raises(SettingsError, match=text), node_of(EstimatorNodeSettings(), "-p", argument):
+    with (
+        pytest.raises(SettingsError, match=text),
+        node_of(EstimatorNodeSettings(), '-p', argument),
+    ):
         pass
 
 
 def test_unknown_parameters_are_refused_with_the_nearest_name(tmp_path):
-    file = tmp_path / "mine.yaml"
-    file.write_text("/**:\n  ros__parameters:\n    intake:\n      max_backlogg: 0.1\n")
-    with node_of(EstimatorNodeSettings(), "--params-file", str(file)) as node, \
-            pytest.raises(SettingsError, match=r"'intake.max_backlogg'; did you mean 'intake.max_backlog'\?"):
+    file = tmp_path / 'mine.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    intake:\n      max_backlogg: 0.1\n')
+    with (
+        node_of(EstimatorNodeSettings(), '--params-file', str(file)) as node,
+        pytest.raises(
+            SettingsError, match=r"'intake.max_backlogg'; did you mean 'intake.max_backlog'\?"
+        ),
+    ):
         node.check_parameters()
 
 
 def test_ros_own_parameters_are_no_strangers():
-    with node_of(EstimatorNodeSettings(), "-p", "use_sim_time:=true") as node:
+    with node_of(EstimatorNodeSettings(), '-p', 'use_sim_time:=true') as node:
         node.check_parameters()
 
 
@@ -90,24 +110,24 @@ def test_changes_at_run_time_are_asked_about():
 
     def apply(values):
         asked.append(values)
-        return "not now" if "robot" in values else None
+        return 'not now' if 'robot' in values else None
 
     with node_of(EstimatorNodeSettings()) as node:
         parameters.guard(node, apply)
-        assert node.set_parameters([Parameter("lag_warning", value=0.5)])[0].successful
-        refused = node.set_parameters([Parameter("robot", value="x")])[0]
-        assert not refused.successful and refused.reason == "not now"
-        assert asked == [{"lag_warning": 0.5}, {"robot": "x"}]
+        assert node.set_parameters([Parameter('lag_warning', value=0.5)])[0].successful
+        refused = node.set_parameters([Parameter('robot', value='x')])[0]
+        assert not refused.successful and refused.reason == 'not now'
+        assert asked == [{'lag_warning': 0.5}, {'robot': 'x'}]
         assert parameters.read(node, EstimatorNodeSettings).lag_warning == 0.5
 
 
-@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize('name', NODES)
 def test_the_yaml_of_every_node_is_in_step_with_its_settings(name):
     """Else run `python -m continuum_loc.nodes.write_config config`."""
-    text = (CONFIG / f"{name}.yaml").read_text()
+    text = (CONFIG / f'{name}.yaml').read_text()
     assert text == config_text(name)
-    given = yaml.safe_load(text)["/**"]["ros__parameters"]
-    assert set(given) == {leaf for leaf, _, _ in parameters.leaves(NODES[name], "")}
-    with node_of(NODES[name], "--params-file", str(CONFIG / f"{name}.yaml"), name=name) as node:
+    given = yaml.safe_load(text)['/**']['ros__parameters']
+    assert set(given) == {leaf for leaf, _, _ in parameters.leaves(NODES[name], '')}
+    with node_of(NODES[name], '--params-file', str(CONFIG / f'{name}.yaml'), name=name) as node:
         node.check_parameters()
         assert node.settings == NODES[name]

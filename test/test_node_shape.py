@@ -5,43 +5,54 @@ import signal
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
-from node_graph import Client, Process, fresh_domain
-from std_srvs.srv import Trigger
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 
 from continuum_loc.robot import load_robot
+from node_graph import Client, fresh_domain, Process
+from std_srvs.srv import Trigger
 
 pytestmark = pytest.mark.timeout(300)
-OUTPUTS = ("shape/poses", "shape/curve", "/diagnostics")
+OUTPUTS = ('shape/poses', 'shape/curve', '/diagnostics')
 
 
 def test_the_simulated_arm_is_followed_live(tmp_path):
     domain = fresh_domain()
-    node = Process("shape", domain, tmp_path, diagnostics_rate=5)
-    node.await_log("ready:")
-    robot = load_robot("hall_arm")
+    node = Process('shape', domain, tmp_path, diagnostics_rate=5)
+    node.await_log('ready:')
+    robot = load_robot('hall_arm')
     with Client(domain) as client:
-        for topic in (*OUTPUTS, "ground_truth/poses"):
+        for topic in (*OUTPUTS, 'ground_truth/poses'):
             client.hear(topic)
-        simulator = Process("simulator", domain, tmp_path, robot="hall_arm", scene="none", trajectory="free1",
-                            duration=4, wait_for=1)
+        simulator = Process(
+            'simulator',
+            domain,
+            tmp_path,
+            robot='hall_arm',
+            scene='none',
+            trajectory='free1',
+            duration=4,
+            wait_for=1,
+        )
         assert client.until(lambda: simulator.popen.poll() is not None)
         assert simulator.wait() == 0, simulator.log
         # The node may still be working through what it has buffered when the simulator is done.
-        assert client.until(lambda: all(client.heard[topic] for topic in OUTPUTS)
-                            and len(client.heard["shape/poses"]) > 40), node.log
-        poses, truth = client.heard["shape/poses"], client.heard["ground_truth/poses"]
+        assert client.until(
+            lambda: (
+                all(client.heard[topic] for topic in OUTPUTS)
+                and len(client.heard['shape/poses']) > 40
+            )
+        ), node.log
+        poses, truth = client.heard['shape/poses'], client.heard['ground_truth/poses']
         assert all(len(pose.T_map_body) == len(robot.hall) for pose in poses)
         assert _error(poses, truth) < 0.003
-        curve = client.heard["shape/curve"][-1].T_map_backbone
+        curve = client.heard['shape/curve'][-1].T_map_backbone
         np.testing.assert_allclose(np.linalg.det(curve[:, :3, :3]), 1.0, atol=1e-6)
-        along = np.einsum("ij,ij->i", curve[:-1, :3, 0], np.diff(curve[:, :3, 3], axis=0))
+        along = np.einsum('ij,ij->i', curve[:-1, :3, 0], np.diff(curve[:, :3, 3], axis=0))
         assert (along > 0.0).all()  # the frames' x points along the curve
-        name, _, _, values = client.heard["/diagnostics"][-1].statuses[0]
-        assert "hall_arm" in name and "faults" in values
-        assert client.call(Trigger, "shape/reset", Trigger.Request()).success
-    assert node.stop(signal.SIGTERM) == 0 and "Traceback" not in node.log, node.log
+        name, _, _, values = client.heard['/diagnostics'][-1].statuses[0]
+        assert 'hall_arm' in name and 'faults' in values
+        assert client.call(Trigger, 'shape/reset', Trigger.Request()).success
+    assert node.stop(signal.SIGTERM) == 0 and 'Traceback' not in node.log, node.log
 
 
 def _error(poses, truth):

@@ -2,97 +2,148 @@
 
 import ast
 import os
+from pathlib import Path
 import re
 import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-ROS = ("rclpy", "rcl_interfaces", "sensor_msgs", "geometry_msgs", "nav_msgs", "std_msgs", "std_srvs", "diagnostic_msgs",
-       "builtin_interfaces", "rosgraph_msgs", "tf2_msgs", "tf2_ros", "launch", "launch_ros")
-HEAVY = ("open3d", "mujoco", "trimesh", "matplotlib", "plotly", "pandas", "rosbags")
-NODES = ("simulator", "estimator", "shape", "recorder", "replayer", "viewer")
+ROS = (
+    'rclpy',
+    'rcl_interfaces',
+    'sensor_msgs',
+    'geometry_msgs',
+    'nav_msgs',
+    'std_msgs',
+    'std_srvs',
+    'diagnostic_msgs',
+    'builtin_interfaces',
+    'rosgraph_msgs',
+    'tf2_msgs',
+    'tf2_ros',
+    'launch',
+    'launch_ros',
+)
+HEAVY = ('open3d', 'mujoco', 'trimesh', 'matplotlib', 'plotly', 'pandas', 'rosbags')
+NODES = ('simulator', 'estimator', 'shape', 'recorder', 'replayer', 'viewer')
 
 
-def _modules(skip=("nodes",)):
-    for package in ("continuum_loc", "msg_tools"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            parts = path.relative_to(ROOT).with_suffix("").parts
+def _modules(skip=('nodes',)):
+    for package in ('continuum_loc', 'msg_tools'):
+        for path in sorted((ROOT / package).rglob('*.py')):
+            parts = path.relative_to(ROOT).with_suffix('').parts
             if not set(parts) & set(skip):
-                yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+                yield '.'.join(parts[:-1] if parts[-1] == '__init__' else parts), path
 
 
 def _python(code, **environment):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300,
-                          env=os.environ | environment, cwd=ROOT)
+    return subprocess.run(
+        [sys.executable, '-c', code],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | environment,
+        cwd=ROOT,
+    )
 
 
 def test_the_core_imports_without_ros():
     """Every module outside nodes/ loads in a Python where ROS cannot be imported."""
     names = [name for name, _ in _modules()]
-    code = (f"import sys\nfor name in {ROS!r}: sys.modules[name] = None\n"
-            f"import importlib\nfor name in {names!r}: importlib.import_module(name)\n")
+    code = (
+        f'import sys\nfor name in {ROS!r}: sys.modules[name] = None\n'
+        f'import importlib\nfor name in {names!r}: importlib.import_module(name)\n'
+    )
     done = _python(code)
     assert done.returncode == 0, done.stderr
 
 
 def test_importing_the_package_is_light():
-    code = ("import sys, continuum_loc, msg_tools, continuum_loc.robot, continuum_loc.measurements\n"
-            f"import continuum_loc.nodes.live\nprint([name for name in {ROS + HEAVY!r} if name in sys.modules])")
-    assert _python(code).stdout.strip() == "[]"
+    code = (
+        'import sys, continuum_loc, msg_tools, continuum_loc.robot, continuum_loc.measurements\n'
+        f'import continuum_loc.nodes.live\nprint([name for name in {ROS + HEAVY!r} if name in sys.modules])'
+    )
+    assert _python(code).stdout.strip() == '[]'
 
 
 def test_only_nodes_and_launch_files_know_ros():
-    for name, path in _modules(skip=("nodes",)):
-        imported = {alias.name.split(".")[0] for node in ast.walk(ast.parse(path.read_text()))
-                    if isinstance(node, ast.Import) for alias in node.names}
-        imported |= {node.module.split(".")[0] for node in ast.walk(ast.parse(path.read_text()))
-                     if isinstance(node, ast.ImportFrom) and node.module and node.level == 0}
-        assert not imported & set(ROS), f"{name} imports {imported & set(ROS)}"
+    for name, path in _modules(skip=('nodes',)):
+        imported = {
+            alias.name.split('.')[0]
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Import)
+            for alias in node.names
+        }
+        imported |= {
+            node.module.split('.')[0]
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.ImportFrom) and node.module and node.level == 0
+        }
+        assert not imported & set(ROS), f'{name} imports {imported & set(ROS)}'
 
 
 def test_nothing_outside_launch_files_needs_what_has_no_wheel():
-    absent = {"sensor_msgs_py", "tf2_ros", "tf2_msgs", "launch", "launch_ros", "rosbag2_py", "message_filters",
-              "diagnostic_updater"}
+    absent = {
+        'sensor_msgs_py',
+        'tf2_ros',
+        'tf2_msgs',
+        'launch',
+        'launch_ros',
+        'rosbag2_py',
+        'message_filters',
+        'diagnostic_updater',
+    }
     for name, path in _modules(skip=()):
         for node in ast.walk(ast.parse(path.read_text())):
             module = node.module if isinstance(node, ast.ImportFrom) else None
-            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [module or ""]
-            assert not {m.split(".")[0] for m in modules} & absent, f"{name} imports {modules}"
+            modules = (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [module or '']
+            )
+            assert not {m.split('.')[0] for m in modules} & absent, f'{name} imports {modules}'
 
 
 def test_package_xml_is_what_colcon_takes_for_ament_python():
-    package = ElementTree.parse(ROOT / "package.xml").getroot()
-    assert package.findtext("name") == "continuum_loc"
-    assert package.findtext("export/build_type") == "ament_python"
-    # An invalid address makes colcon take the package for plain Python, without a word: catkin_pkg's own rule.
-    assert re.match(r"^[a-zA-Z0-9._%+-]+@[a-zA-Z0-9._%+-]+\.[a-zA-Z]{2,6}$", package.find("maintainer").get("email"))
-    version = re.search(r'version="([\d.]+)"', (ROOT / "setup.py").read_text())[1]
-    assert package.findtext("version") == version
-    assert (ROOT / "resource" / "continuum_loc").is_file()
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert package.findtext('name') == 'continuum_loc'
+    assert package.findtext('export/build_type') == 'ament_python'
+    # An invalid address makes colcon take the package for plain Python, without a word:
+    # catkin_pkg's own rule.
+    assert re.match(
+        r'^[a-zA-Z0-9._%+-]+@[a-zA-Z0-9._%+-]+\.[a-zA-Z]{2,6}$',
+        package.find('maintainer').get('email'),
+    )
+    version = re.search(r'version=.([\d.]+).', (ROOT / 'setup.py').read_text())[1]
+    assert package.findtext('version') == version
+    assert (ROOT / 'resource' / 'continuum_loc').is_file()
 
 
 def test_pyproject_leaves_the_metadata_to_setup_py():
     import tomllib
 
-    assert "project" not in tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert 'project' not in tomllib.loads((ROOT / 'pyproject.toml').read_text())
 
 
 def test_every_node_has_its_executable_where_ros2_run_looks():
     for node in NODES:
-        path = ROOT / "resource" / "executables" / node
-        assert os.access(path, os.X_OK) and path.read_text().startswith("#!/bin/sh")
-        assert (ROOT / "continuum_loc" / "nodes" / f"{node}.py").is_file()
-        assert (ROOT / "config" / f"{node}.yaml").is_file()
+        path = ROOT / 'resource' / 'executables' / node
+        assert os.access(path, os.X_OK) and path.read_text().startswith('#!/bin/sh')
+        assert (ROOT / 'continuum_loc' / 'nodes' / f'{node}.py').is_file()
+        assert (ROOT / 'config' / f'{node}.yaml').is_file()
 
 
 def test_requirements_are_pinned_and_name_no_index():
-    lines = [line for line in (ROOT / "requirements.txt").read_text().splitlines() if line and line[0] != "#"]
-    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+!]+( ?;.*)?", line) for line in lines)
+    lines = [
+        line
+        for line in (ROOT / 'requirements.txt').read_text().splitlines()
+        if line and line[0] != '#'
+    ]
+    assert all(re.fullmatch(r'[A-Za-z0-9._-]+==[A-Za-z0-9.+!]+( ?;.*)?', line) for line in lines)
 
 
 @pytest.mark.timeout(300)
@@ -100,20 +151,39 @@ def test_a_wheel_holds_everything_that_runs(tmp_path):
     """Built from a copy of the tracked files: data, executables and entry points are in it."""
     import zipfile
 
-    files = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    files = subprocess.run(
+        ['git', 'ls-files'], cwd=ROOT, capture_output=True, text=True
+    ).stdout.split()
     if not files:
-        pytest.skip("not a git checkout")
+        pytest.skip('not a git checkout')
     for name in files:
-        if (ROOT / name).is_file() and not name.startswith("test/"):
-            (tmp_path / "src" / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, tmp_path / "src" / name)
-    done = subprocess.run([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
-                           "--wheel-dir", str(tmp_path), str(tmp_path / "src")], capture_output=True, text=True)
+        if (ROOT / name).is_file() and not name.startswith('test/'):
+            (tmp_path / 'src' / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, tmp_path / 'src' / name)
+    done = subprocess.run(
+        [
+            sys.executable,
+            '-m',
+            'pip',
+            'wheel',
+            '--quiet',
+            '--no-deps',
+            '--no-build-isolation',
+            '--wheel-dir',
+            str(tmp_path),
+            str(tmp_path / 'src'),
+        ],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
-    inside = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
-    data = [name.split(".data/data/")[1] for name in inside if ".data/data/" in name]
-    assert {f"lib/continuum_loc/{node}" for node in NODES} <= set(data)
-    assert {f"share/continuum_loc/config/{node}.yaml" for node in NODES} <= set(data)
-    assert {"share/ament_index/resource_index/packages/continuum_loc", "share/continuum_loc/package.xml"} <= set(data)
-    packaged = {str(path.relative_to(ROOT)) for path in (ROOT / "continuum_loc").rglob("*.yaml")}
+    inside = zipfile.ZipFile(next(tmp_path.glob('*.whl'))).namelist()
+    data = [name.split('.data/data/')[1] for name in inside if '.data/data/' in name]
+    assert {f'lib/continuum_loc/{node}' for node in NODES} <= set(data)
+    assert {f'share/continuum_loc/config/{node}.yaml' for node in NODES} <= set(data)
+    assert {
+        'share/ament_index/resource_index/packages/continuum_loc',
+        'share/continuum_loc/package.xml',
+    } <= set(data)
+    packaged = {str(path.relative_to(ROOT)) for path in (ROOT / 'continuum_loc').rglob('*.yaml')}
     assert packaged & set(files) <= set(inside)

@@ -2,59 +2,81 @@
 
 import os
 
-import numpy as np
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
 from continuum_loc import lie
 from continuum_loc.measurements import ImuSample, TrackedPose, TruthSample
 from continuum_loc.robot import load_robot
+from hypothesis import given
+from hypothesis import strategies as st
 from msg_tools.bag import read_bag
-from msg_tools.tendon_robot import R_THEIRS_OURS, STAMP_OF_ZERO, T_THEIRS_OURS, TrialError, import_trial, read_recording
+from msg_tools.tendon_robot import (
+    import_trial,
+    R_THEIRS_OURS,
+    read_recording,
+    STAMP_OF_ZERO,
+    T_THEIRS_OURS,
+    TrialError,
+)
+import numpy as np
+import pytest
 
-needs_data = pytest.mark.skipif(not os.environ.get("CONTINUUM_LOC_DATA"),
-                                reason="CONTINUUM_LOC_DATA, the folder of the recorded trials, is unset")
-ROBOT = load_robot("tendon_robot")
+needs_data = pytest.mark.skipif(
+    not os.environ.get('CONTINUUM_LOC_DATA'),
+    reason='CONTINUUM_LOC_DATA, the folder of the recorded trials, is unset',
+)
+ROBOT = load_robot('tendon_robot')
 DISCS = (0.0, 0.1165, 0.233, 0.3495, 0.466)
 
 
 def _write(path, kind, s, rows):
-    lines = [f"sensor type:,{kind}", "timestamp (s),arclength (m),data"]
-    path.write_text("\n".join(lines + [",".join(repr(float(x)) for x in (t, s, *data)) for t, data in rows]) + "\n")
+    lines = [f'sensor type:,{kind}', 'timestamp (s),arclength (m),data']
+    path.write_text(
+        '\n'.join(lines + [','.join(repr(float(x)) for x in (t, s, *data)) for t, data in rows])
+        + '\n'
+    )
 
 
 @pytest.fixture
 def trial(tmp_path):
     """A straight robot along the map's z that turns about it at 0.5 rad/s, in the files' own frames."""
-    folder = tmp_path / "trial"
+    folder = tmp_path / 'trial'
     folder.mkdir()
     times = np.arange(-0.04, 1.0, 0.02)
 
     def pose(t, s):
-        return lie.log(np.block([[lie.so3_exp(np.array([0, 0, 0.5 * t])), np.array([[0], [0], [s]])],
-                                 [np.zeros((1, 3)), np.ones((1, 1))]]))
+        return lie.log(
+            np.block(
+                [
+                    [lie.so3_exp(np.array([0, 0, 0.5 * t])), np.array([[0], [0], [s]])],
+                    [np.zeros((1, 3)), np.ones((1, 1))],
+                ]
+            )
+        )
 
     for number, s in enumerate((0.0, 0.466)):
-        _write(folder / f"aurora{number}.csv", "aurora", s, [(t, pose(t, s)) for t in times])
-    for name, s in (("mid", 0.233), ("ee", 0.466)):
-        _write(folder / f"gyro_{name}.csv", "gyro", s, [(t, (0.0, 0.0, 0.5)) for t in times])
+        _write(folder / f'aurora{number}.csv', 'aurora', s, [(t, pose(t, s)) for t in times])
+    for name, s in (('mid', 0.233), ('ee', 0.466)):
+        _write(folder / f'gyro_{name}.csv', 'gyro', s, [(t, (0.0, 0.0, 0.5)) for t in times])
     for number, s in enumerate(DISCS):
-        _write(folder / f"vicon{number}.csv", "vicon", s, [(t, pose(t, s)) for t in times[2::3]])
+        _write(folder / f'vicon{number}.csv', 'vicon', s, [(t, pose(t, s)) for t in times[2::3]])
     return folder
 
 
 def test_the_tangent_becomes_body_x_and_motion_keeps_its_meaning(trial):
     """A rate in the imported body frame is what the imported poses turn by: dT/dt = T hat(omega), about the tangent."""
     recording = read_recording(trial, ROBOT)
-    tip = [sample for sample in recording.measurements
-           if isinstance(sample, TrackedPose) and sample.sensor == "tip_tracker"]
+    tip = [
+        sample
+        for sample in recording.measurements
+        if isinstance(sample, TrackedPose) and sample.sensor == 'tip_tracker'
+    ]
     rate = next(sample for sample in recording.measurements if isinstance(sample, ImuSample))
     np.testing.assert_allclose(tip[0].T_map_sensor[:3, 0], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(rate.angular_velocity, [0.5, 0, 0], atol=1e-12)
     turned = lie.log(lie.inverse(tip[0].T_map_sensor) @ tip[10].T_map_sensor)[3:]
-    np.testing.assert_allclose(turned, rate.angular_velocity * (tip[10].stamp - tip[0].stamp) * 1e-9, atol=1e-9)
-    np.testing.assert_allclose(recording.truth["disc2"][1][0][:3, 3], [0, 0, 0.233], atol=1e-12)
+    np.testing.assert_allclose(
+        turned, rate.angular_velocity * (tip[10].stamp - tip[0].stamp) * 1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(recording.truth['disc2'][1][0][:3, 3], [0, 0, 0.233], atol=1e-12)
 
 
 def test_the_axes_are_renamed_by_a_rotation():
@@ -63,21 +85,30 @@ def test_the_axes_are_renamed_by_a_rotation():
     np.testing.assert_array_equal(T_THEIRS_OURS[:3, :3] @ [1, 0, 0], [0, 0, 1])
 
 
-@given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
+@given(
+    st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6),
+    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
+)
 def test_renaming_commutes_with_moving(xi, omega):
     """T Exp(w) renamed equals T renamed, moved by the renamed w, for any pose and rate."""
     T, w = lie.exp(0.5 * np.array(xi)), np.concatenate([np.zeros(3), omega])
     renamed = np.concatenate([np.zeros(3), np.array(omega) @ R_THEIRS_OURS])
-    np.testing.assert_allclose(T @ lie.exp(w) @ T_THEIRS_OURS, T @ T_THEIRS_OURS @ lie.exp(renamed), atol=1e-9)
+    np.testing.assert_allclose(
+        T @ lie.exp(w) @ T_THEIRS_OURS, T @ T_THEIRS_OURS @ lie.exp(renamed), atol=1e-9
+    )
 
 
 def test_a_bag_gives_back_what_was_imported(trial, tmp_path):
-    counts = import_trial(trial, tmp_path / "bag", ROBOT)
+    counts = import_trial(trial, tmp_path / 'bag', ROBOT)
     recording = read_recording(trial, ROBOT)
-    back = [item for _, item in read_bag(tmp_path / "bag")]
-    assert counts == {"tracker/base_tracker": 52, "tracker/tip_tracker": 52, "imu/data_raw": 104,
-                      "ground_truth/poses": 17}
-    for kind, wanted in (("TrackedPose", TrackedPose), ("ImuSample", ImuSample)):
+    back = [item for _, item in read_bag(tmp_path / 'bag')]
+    assert counts == {
+        'tracker/base_tracker': 52,
+        'tracker/tip_tracker': 52,
+        'imu/data_raw': 104,
+        'ground_truth/poses': 17,
+    }
+    for kind, wanted in (('TrackedPose', TrackedPose), ('ImuSample', ImuSample)):
         ours = [s for s in recording.measurements if isinstance(s, wanted)]
         theirs = [s for s in back if isinstance(s, wanted)]
         assert [(s.stamp, s.sensor) for s in ours] == [(s.stamp, s.sensor) for s in theirs], kind
@@ -88,32 +119,39 @@ def test_a_bag_gives_back_what_was_imported(trial, tmp_path):
     assert min(s.stamp for s in back) == STAMP_OF_ZERO - 40_000_000
 
 
-@pytest.mark.parametrize(("line", "replaced", "said"), [
-    (0, "sensor type:,sonar", "one of aurora, vicon, gyro"), (5, "0.1,0.0,1,2,3", "expected 8 numbers"),
-    (5, "0.1,0.0,1,2,3,4,5,x", "line 6"), (5, "0.1,0.0,1,2,3,4,5,nan", "not finite"),
-    (5, "0.1,0.3,1,2,3,4,5,6", "a file holds one sensor"), (5, "-3,0.0,1,2,3,4,5,6", "increase")])
+@pytest.mark.parametrize(
+    ('line', 'replaced', 'said'),
+    [
+        (0, 'sensor type:,sonar', 'one of aurora, vicon, gyro'),
+        (5, '0.1,0.0,1,2,3', 'expected 8 numbers'),
+        (5, '0.1,0.0,1,2,3,4,5,x', 'line 6'),
+        (5, '0.1,0.0,1,2,3,4,5,nan', 'not finite'),
+        (5, '0.1,0.3,1,2,3,4,5,6', 'a file holds one sensor'),
+        (5, '-3,0.0,1,2,3,4,5,6', 'increase'),
+    ],
+)
 def test_damaged_files_are_refused_with_their_place(trial, line, replaced, said):
-    path = trial / "aurora0.csv"
+    path = trial / 'aurora0.csv'
     lines = path.read_text().splitlines()
     lines[line] = replaced
-    path.write_text("\n".join(lines))
+    path.write_text('\n'.join(lines))
     with pytest.raises(TrialError, match=said) as error:
         read_recording(trial, ROBOT)
-    assert "aurora0.csv" in str(error.value)
+    assert 'aurora0.csv' in str(error.value)
 
 
 def test_what_the_robot_does_not_have_is_named(trial, tmp_path):
-    _write(trial / "gyro_base.csv", "gyro", 0.05, [(0.0, (0, 0, 0))])
-    with pytest.raises(TrialError, match=r"no gyro at s = 0.05 m; it has some at: 0.233, 0.466"):
+    _write(trial / 'gyro_base.csv', 'gyro', 0.05, [(0.0, (0, 0, 0))])
+    with pytest.raises(TrialError, match=r'no gyro at s = 0.05 m; it has some at: 0.233, 0.466'):
         read_recording(trial, ROBOT)
-    with pytest.raises(TrialError, match="no .csv files"):
-        read_recording(tmp_path / "nowhere", ROBOT)
+    with pytest.raises(TrialError, match='no .csv files'):
+        read_recording(tmp_path / 'nowhere', ROBOT)
 
 
 @needs_data
 def test_hermite_curves_give_the_published_figures():
     """The metric is the published one: plain Hermite interpolation has the published RMSE, to its last digit."""
-    from continuum_loc.evaluation.studies.real import HERMITE, WINDOWS, data_folder, hermite_errors
+    from continuum_loc.evaluation.studies.real import data_folder, HERMITE, hermite_errors, WINDOWS
 
     for name, window in WINDOWS.items():
         found = hermite_errors(read_recording(data_folder() / name, ROBOT), ROBOT, window)
@@ -126,6 +164,10 @@ def test_the_smoothed_filter_beats_hermite_and_the_published_filter_inside_the_b
     """At the three discs without a tracker, through the impulses, 0.1 s late; gyros and bending must help there."""
     from continuum_loc.evaluation.studies.real import run
 
-    inner = [claim for claim in run(tmp_path, True, 0, 1) if "lag" in claim.name and "disc4" not in claim.name]
+    inner = [
+        claim
+        for claim in run(tmp_path, True, 0, 1)
+        if 'lag' in claim.name and 'disc4' not in claim.name
+    ]
     assert len(inner) == 6
     assert all(claim.holds for claim in inner), [claim for claim in inner if not claim.holds]

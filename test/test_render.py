@@ -1,24 +1,23 @@
 """The ray-cast pictures show what geometry says: a sphere's disc, its section, and the parts of a robot."""
 
-import numpy as np
-import pytest
-
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.render import (
     ADDED,
     BODY,
-    MISSING,
-    RING,
-    SKY,
     Camera,
-    Shape,
+    MISSING,
     render,
+    RING,
     robot_shapes,
     scene_shapes,
+    Shape,
+    SKY,
 )
 from continuum_loc.simulator.scenes import load_scene
+import numpy as np
+import pytest
 
-trimesh = pytest.importorskip("trimesh")
+trimesh = pytest.importorskip('trimesh')
 RED = (1.0, 0.0, 0.0)
 
 
@@ -34,7 +33,9 @@ def covered(image):
 def test_a_sphere_covers_the_disc_of_its_tangent_cone():
     camera = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), fov_deg=45.0, width=200, height=200)
     image = render([sphere()], camera)
-    tangent = np.tan(np.arcsin(0.5 / 2.0)) / np.tan(np.radians(22.5))  # of half the picture's width
+    tangent = np.tan(np.arcsin(0.5 / 2.0)) / np.tan(
+        np.radians(22.5)
+    )  # of half the picture's width
     assert covered(image).mean() == pytest.approx(np.pi * tangent**2 / 4.0, rel=0.02)
     assert image[100, 100, 0] > 100 and np.all(image[100, 100, 1:] == 0)
 
@@ -42,11 +43,13 @@ def test_a_sphere_covers_the_disc_of_its_tangent_cone():
 def test_a_section_cuts_away_what_lies_before_it():
     whole = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), width=60, height=60)
     beyond = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), width=60, height=60, section=0.6)
-    assert covered(render([sphere()], whole)).any() and not covered(render([sphere()], beyond)).any()
+    assert (
+        covered(render([sphere()], whole)).any() and not covered(render([sphere()], beyond)).any()
+    )
 
 
 def test_a_robot_has_a_body_a_band_per_ring_and_a_box_per_sensor():
-    robot = load_robot("engine")
+    robot = load_robot('engine')
     backbone = np.tile(np.eye(4), (31, 1, 1))
     backbone[:, 0, 3] = np.linspace(0.0, robot.length, 31)
     rings = np.tile(np.eye(4), (5, 1, 1))
@@ -60,8 +63,16 @@ def test_a_robot_has_a_body_a_band_per_ring_and_a_box_per_sensor():
 
 
 def test_daylight_leaves_an_inner_corner_darker_than_the_open_floor():
-    floor = Shape(np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]), RED)
-    wall = Shape(np.array([[-9.0, 0, 0], [9, 0, 0], [9, 0, 9], [-9, 0, 9]]), np.array([[0, 1, 2], [0, 2, 3]]), RED)
+    floor = Shape(
+        np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        RED,
+    )
+    wall = Shape(
+        np.array([[-9.0, 0, 0], [9, 0, 0], [9, 0, 9], [-9, 0, 9]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        RED,
+    )
     camera = Camera((0.0, -1.0, 1.0), (0.0, -0.4, 0.0), fov_deg=50.0, width=40, height=40)
     even, shaded = (render([floor, wall], camera, rays)[..., 0].astype(float) for rays in (0, 64))
     darkening = (shaded / even)[:, 20]
@@ -71,12 +82,12 @@ def test_daylight_leaves_an_inner_corner_darker_than_the_open_floor():
 
 def test_changes_to_the_engine_stand_out():
     """Each change of S8 has its own shape, in the colour of what came or of what went."""
-    scene = load_scene("S8")
+    scene = load_scene('S8')
     shapes = scene_shapes(scene)
-    gone = [anomaly for anomaly in scene.anomalies if anomaly.kind == "missing"]
+    gone = [anomaly for anomaly in scene.anomalies if anomaly.kind == 'missing']
     assert [shape.colour for shape in shapes].count(MISSING) == len(gone)
     added = next(shape for shape in shapes if shape.colour == ADDED)
     places = added.vertices[np.unique(added.faces)]
     for anomaly in scene.anomalies:
         near = np.linalg.norm(places - anomaly.centre, axis=1).min() < anomaly.size
-        assert near == (anomaly.kind == "added"), anomaly.name
+        assert near == (anomaly.kind == 'added'), anomaly.name

@@ -1,13 +1,7 @@
 """The report shows the figures of the run, needs no network, and loses no peak on the way to a picture."""
 
-import re
 from dataclasses import replace
-
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from synthetic import NoisyFilter, samples
+import re
 
 from continuum_loc.evaluation.figures import spans, thin
 from continuum_loc.evaluation.metrics import errors
@@ -18,50 +12,83 @@ from continuum_loc.evaluation.tables import latex, markdown, write_table
 from continuum_loc.evaluation.view import clipped, moments, smooth_backbone, surroundings
 from continuum_loc.measurements import NANOSECONDS
 from continuum_loc.robot import load_robot
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from synthetic import NoisyFilter, samples
 
-ROBOT = load_robot("engine")
+ROBOT = load_robot('engine')
 CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-CUBE_FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
-                       [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])
+CUBE_FACES = np.array(
+    [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
+)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope='module')
 def run(tmp_path_factory):
     result = replay(samples(ROBOT, 4.0), NoisyFilter(ROBOT))
     late = result.track.T_map_ring.copy()
     late[20, 5, 0, 3] += 0.08  # one bad moment at t = 2 s, at the tip
-    result = replace(result, track=replace(result.track, T_map_ring=late), latency_seconds=np.full(40, 0.0123))
-    folder = new_run("replay", tmp_path_factory.mktemp("runs"))
-    save_run(folder, result, kind="replay", seed=3, configuration={"robot": ROBOT, "scene": "S0"})
+    result = replace(
+        result, track=replace(result.track, T_map_ring=late), latency_seconds=np.full(40, 0.0123)
+    )
+    folder = new_run('replay', tmp_path_factory.mktemp('runs'))
+    save_run(folder, result, kind='replay', seed=3, configuration={'robot': ROBOT, 'scene': 'S0'})
     return load_run(folder)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope='module')
 def page(run):
     return write_report(run, Context((CUBE, CUBE_FACES), CUBE)).read_text()
 
 
 def test_report_is_one_file_that_needs_no_network(page):
-    markup = re.sub(r"<script.*?</script>", "", page, flags=re.S)
+    markup = re.sub(r'<script.*?</script>', '', page, flags=re.S)
     assert not re.findall(r'(?:src|href)\s*=\s*"(?!#)', markup)
-    assert "cdn.plot.ly" not in re.sub(r"<script>.{100000,}?</script>", "", page, flags=re.S)
+    assert 'cdn.plot.ly' not in re.sub(r'<script>.{100000,}?</script>', '', page, flags=re.S)
     assert len(page) < 15e6
 
 
 def test_report_shows_the_figures_of_the_summary(run, page):
-    assert f"{100 * run.summary['translation_mae_m']:.2f} cm" in page
-    assert f"{run.summary['rotation_mae_deg']:.2f}°" in page
-    assert "12.3 ms" in page  # the latency
+    assert f'{100 * run.summary["translation_mae_m"]:.2f} cm' in page
+    assert f'{run.summary["rotation_mae_deg"]:.2f}°' in page
+    assert '12.3 ms' in page  # the latency
     for ring in ROBOT.ring_names:
-        assert f"<td class=\"\">{100 * run.summary['rings'][ring]['translation_mae_m']:.2f}</td>" in page
+        assert (
+            f'<td class="">{100 * run.summary["rings"][ring]["translation_mae_m"]:.2f}</td>'
+            in page
+        )
 
 
 def test_the_worst_moment_comes_first_and_leads_to_its_frame(run, page):
-    worst = next(part for group in run_page(run, Context()).groups for part in group if part.title.startswith("Worst"))
+    worst = next(
+        part
+        for group in run_page(run, Context()).groups
+        for part in group
+        if part.title.startswith('Worst')
+    )
     first = worst.table.rows[0]
-    assert first.cells[:2] == ["2.00", "ring5"]
-    shown = moments(run.result, 90, 100, 0.5, extra=errors(settled(run.result.track), run.result.truth).stamps)
-    assert (shown[first.frame].stamp - run.result.track.stamps[0]) / NANOSECONDS == pytest.approx(2.0)
+    assert first.cells[:2] == ['2.00', 'ring5']
+    shown = moments(
+        run.result, 90, 100, 0.5, extra=errors(settled(run.result.track), run.result.truth).stamps
+    )
+    assert (shown[first.frame].stamp - run.result.track.stamps[0]) / NANOSECONDS == pytest.approx(
+        2.0
+    )
     assert f'data-frame="{first.frame}"' in page
 
 
@@ -74,18 +101,26 @@ def test_worst_moments_are_apart_and_sorted(run):
 
 
 def test_a_report_without_truth_says_so(run, tmp_path):
-    blind = replace(run.result, truth=run.result.truth.select(np.zeros(len(run.result.truth), bool)))
-    folder = new_run("replay", tmp_path)
-    save_run(folder, blind, kind="replay", seed=None, configuration={})
+    blind = replace(
+        run.result, truth=run.result.truth.select(np.zeros(len(run.result.truth), bool))
+    )
+    folder = new_run('replay', tmp_path)
+    save_run(folder, blind, kind='replay', seed=None, configuration={})
     text = write_report(load_run(folder)).read_text()
-    assert "No truth was recorded" in text
-    assert "Worst moments" not in text
+    assert 'No truth was recorded' in text
+    assert 'Worst moments' not in text
 
 
 def test_names_from_outside_cannot_inject_markup(run, tmp_path):
-    folder = new_run("replay", tmp_path)
-    save_run(folder, run.result, kind="replay", seed=0, configuration={"scene": "<script>alert(1)</script>"})
-    assert "<script>alert(1)" not in write_report(load_run(folder)).read_text()
+    folder = new_run('replay', tmp_path)
+    save_run(
+        folder,
+        run.result,
+        kind='replay',
+        seed=0,
+        configuration={'scene': '<script>alert(1)</script>'},
+    )
+    assert '<script>alert(1)' not in write_report(load_run(folder)).read_text()
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300), st.integers(1, 50))
@@ -111,7 +146,8 @@ def test_smooth_backbone_follows_an_arc():
     coarse = smooth_backbone(poses_at(ROBOT, np.linspace(0.0, 1.5, 6), 1.0)[None])[0]
     fine = poses_at(ROBOT, true_s, 1.0)[:, :3, 3]
     gap = np.linalg.norm(coarse[:, None] - fine[None], axis=-1).min(axis=0)
-    # Cubic Hermite over an arc of 0.3 rad deviates by about angle^4 / 384 of its length, plus the sampling of 4 cm.
+    # Cubic Hermite over an arc of 0.3 rad deviates by about angle^4 / 384 of its length, plus the
+    # sampling of 4 cm.
     assert gap.max() < 0.02
     np.testing.assert_allclose(coarse[[0, -1]], fine[[0, -1]], atol=1e-12)
 
@@ -120,7 +156,9 @@ def test_clipping_a_cube_leaves_the_area_inside():
     vertices, faces = clipped(CUBE, CUBE_FACES, np.full(3, -2.0), np.array([0.5, 2.0, 2.0]))
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     # Of the six sides of 4 m2, the far one goes and four keep three quarters.
-    assert 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() == pytest.approx(4.0 + 4 * 3.0)
+    assert 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() == pytest.approx(
+        4.0 + 4 * 3.0
+    )
     assert vertices[faces][..., 0].max() <= 0.5 + 1e-12
 
 
@@ -134,20 +172,25 @@ def test_surroundings_stay_within_reach_and_number(run):
 
 
 def test_tables_as_text():
-    pd = pytest.importorskip("pandas")
-    frame = pd.DataFrame([{"scene": "S0", "MAE_cm": 0.123456, "n": 3, "note": "a|b"}, {"scene": "S1", "MAE_cm": None}])
+    pd = pytest.importorskip('pandas')
+    frame = pd.DataFrame(
+        [
+            {'scene': 'S0', 'MAE_cm': 0.123456, 'n': 3, 'note': 'a|b'},
+            {'scene': 'S1', 'MAE_cm': None},
+        ]
+    )
     lines = markdown(frame).splitlines()
-    assert lines[0] == "| scene | MAE_cm | n | note |"
-    assert lines[2] == r"| S0 | 0.1235 | 3 | a\|b |"
-    assert lines[3] == "| S1 | - | - | - |"
-    assert r"MAE\_cm" in latex(frame)
-    assert latex(frame).count(r"\\") == 3
+    assert lines[0] == '| scene | MAE_cm | n | note |'
+    assert lines[2] == r'| S0 | 0.1235 | 3 | a\|b |'
+    assert lines[3] == '| S1 | - | - | - |'
+    assert r'MAE\_cm' in latex(frame)
+    assert latex(frame).count(r'\\') == 3
 
 
 def test_a_table_read_back_is_the_table(tmp_path):
     import pandas as pd
 
-    rows = [{"name": "a", "value": 1.0 / 3.0}, {"name": "b", "value": 1e-300}]
-    write_table(rows, tmp_path / "t")
-    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "t.csv"), pd.DataFrame(rows))
-    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".json", ".md", ".tex"}
+    rows = [{'name': 'a', 'value': 1.0 / 3.0}, {'name': 'b', 'value': 1e-300}]
+    write_table(rows, tmp_path / 't')
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / 't.csv'), pd.DataFrame(rows))
+    assert {path.suffix for path in tmp_path.iterdir()} == {'.csv', '.json', '.md', '.tex'}

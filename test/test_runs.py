@@ -3,23 +3,29 @@
 import json
 import multiprocessing
 
-import numpy as np
-import pytest
-import yaml
-from synthetic import START, NoisyFilter, samples, truth_at
-
 from continuum_loc import lie
 from continuum_loc.evaluation.replay import place_points, replay
-from continuum_loc.evaluation.runs import RunError, distribution, load_run, new_run, save_run, summary_of
+from continuum_loc.evaluation.runs import (
+    distribution,
+    load_run,
+    new_run,
+    RunError,
+    save_run,
+    summary_of,
+)
 from continuum_loc.evaluation.tracks import Track
 from continuum_loc.measurements import NANOSECONDS, TofFrame
 from continuum_loc.robot import load_robot
+import numpy as np
+import pytest
+from synthetic import NoisyFilter, samples, START, truth_at
+import yaml
 
-ROBOT = load_robot("engine")
-REQUIRED = {"translation_mae_m", "translation_rmse_m", "rotation_mae_deg", "rotation_rmse_deg"}
+ROBOT = load_robot('engine')
+REQUIRED = {'translation_mae_m', 'translation_rmse_m', 'rotation_mae_deg', 'rotation_rmse_deg'}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope='module')
 def result():
     return replay(samples(ROBOT, 3.0), NoisyFilter(ROBOT))
 
@@ -33,18 +39,24 @@ def test_the_same_samples_give_the_same_estimate_to_the_last_bit(result):
 
 def test_summary_has_what_is_promised(result):
     summary = summary_of(result)
-    assert summary.keys() >= REQUIRED | {"nees_per_dof", "coverage_95", "real_time_factor", "step_ms", "counts"}
-    assert set(summary["rings"]) == set(ROBOT.ring_names)
-    assert all(figures.keys() >= REQUIRED for figures in summary["rings"].values())
-    assert summary["step_ms"].keys() >= {"mean", "p95", "p99"}
-    assert "latency_ms" not in summary  # nothing was live
-    assert summary["counts"]["received"] == {"tof": 30 * 16, "imu": 300 * 5}
+    assert summary.keys() >= REQUIRED | {
+        'nees_per_dof',
+        'coverage_95',
+        'real_time_factor',
+        'step_ms',
+        'counts',
+    }
+    assert set(summary['rings']) == set(ROBOT.ring_names)
+    assert all(figures.keys() >= REQUIRED for figures in summary['rings'].values())
+    assert summary['step_ms'].keys() >= {'mean', 'p95', 'p99'}
+    assert 'latency_ms' not in summary  # nothing was live
+    assert summary['counts']['received'] == {'tof': 30 * 16, 'imu': 300 * 5}
 
 
 def test_estimates_before_the_first_fit_are_counted_and_not_judged(result):
-    estimates = summary_of(result)["estimates"]
-    assert estimates["initialising"] == 5
-    assert estimates["judged"] == estimates["tracking"] == 25
+    estimates = summary_of(result)['estimates']
+    assert estimates['initialising'] == 5
+    assert estimates['judged'] == estimates['tracking'] == 25
 
 
 def test_real_time_factor_is_data_time_over_processing_time(result):
@@ -55,63 +67,73 @@ def test_real_time_factor_is_data_time_over_processing_time(result):
 
 def test_points_are_placed_by_the_pose_of_their_ring_at_their_stamp():
     stamps = START + np.arange(3) * NANOSECONDS // 10
-    track = Track(stamps, ("base", *ROBOT.ring_names), np.stack([truth_at(ROBOT, stamp) for stamp in stamps]))
+    track = Track(
+        stamps, ('base', *ROBOT.ring_names), np.stack([truth_at(ROBOT, stamp) for stamp in stamps])
+    )
     sensor, stamp = ROBOT.tof[7], int(stamps[0] + NANOSECONDS // 20)
     points = np.array([[0.3, 0.0, 0.0], [0.2, 0.1, 0.0]])
     blank = np.zeros(2)
     frame = TofFrame(stamp, sensor.name, points, blank, blank, np.array([5, 255], np.uint8))
     cloud = place_points([frame], track, ROBOT)
     column = track.names.index(sensor.ring)
-    T_map_ring = lie.interpolate(track.T_map_ring[0, column], track.T_map_ring[1, column], np.array(0.5))
+    T_map_ring = lie.interpolate(
+        track.T_map_ring[0, column], track.T_map_ring[1, column], np.array(0.5)
+    )
     expected = (T_map_ring @ sensor.mount.T_ring_sensor @ [0.3, 0.0, 0.0, 1.0])[:3]
-    np.testing.assert_allclose(cloud.points, [expected], atol=1e-12)  # the zone without return is left out
+    np.testing.assert_allclose(
+        cloud.points, [expected], atol=1e-12
+    )  # the zone without return is left out
 
 
 def test_a_run_folder_gives_back_what_went_in(result, tmp_path):
-    folder = new_run("replay", tmp_path)
-    save_run(folder, result, kind="replay", seed=7, configuration={"robot": ROBOT})
-    run = load_run(tmp_path / "latest")
+    folder = new_run('replay', tmp_path)
+    save_run(folder, result, kind='replay', seed=7, configuration={'robot': ROBOT})
+    run = load_run(tmp_path / 'latest')
     assert run.result.digest == result.digest
-    assert run.summary["seed"] == 7
-    assert run.configuration["robot"]["name"] == "engine"
+    assert run.summary['seed'] == 7
+    assert run.configuration['robot']['name'] == 'engine'
     np.testing.assert_array_equal(run.result.cloud.points, result.cloud.points)
     np.testing.assert_array_equal(run.result.track.backbone, result.track.backbone)
-    names = {path.name for path in (folder / "trajectories").iterdir()}
-    assert names >= {f"{kind}_{ring}.tum" for kind in ("estimate", "truth") for ring in ROBOT.ring_names}
-    json.loads((folder / "summary.json").read_text(), parse_constant=pytest.fail)  # strict: no NaN, no Infinity
-    yaml.safe_load((folder / "configuration.yaml").read_text())
+    names = {path.name for path in (folder / 'trajectories').iterdir()}
+    assert names >= {
+        f'{kind}_{ring}.tum' for kind in ('estimate', 'truth') for ring in ROBOT.ring_names
+    }
+    json.loads(
+        (folder / 'summary.json').read_text(), parse_constant=pytest.fail
+    )  # strict: no NaN, no Infinity
+    yaml.safe_load((folder / 'configuration.yaml').read_text())
 
 
 def test_runs_are_numbered_and_latest_leads_to_the_newest(tmp_path):
-    first, second = new_run("demo", tmp_path), new_run("replay", tmp_path)
-    assert (first.name, second.name) == ("0001-demo", "0002-replay")
-    assert (tmp_path / "latest").resolve() == second.resolve()
+    first, second = new_run('demo', tmp_path), new_run('replay', tmp_path)
+    assert (first.name, second.name) == ('0001-demo', '0002-replay')
+    assert (tmp_path / 'latest').resolve() == second.resolve()
 
 
 def test_parallel_runs_get_different_numbers(tmp_path):
-    with multiprocessing.get_context("fork").Pool(4) as pool:
-        folders = pool.starmap(new_run, [("trial", tmp_path)] * 12)
+    with multiprocessing.get_context('fork').Pool(4) as pool:
+        folders = pool.starmap(new_run, [('trial', tmp_path)] * 12)
     assert len({folder.name for folder in folders}) == 12
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):
-    with pytest.raises(RunError, match=r"no run folder: it has no summary\.json"):
+    with pytest.raises(RunError, match=r'no run folder: it has no summary\.json'):
         load_run(tmp_path)
-    (tmp_path / "latest").mkdir()
-    with pytest.raises(RunError, match="in the way"):
-        new_run("replay", tmp_path)
+    (tmp_path / 'latest').mkdir()
+    with pytest.raises(RunError, match='in the way'):
+        new_run('replay', tmp_path)
 
 
 def test_a_damaged_result_is_named(result, tmp_path):
-    folder = new_run("replay", tmp_path)
-    save_run(folder, result, kind="replay", seed=0, configuration={})
-    (folder / "result.npz").write_bytes(b"not a result")
-    with pytest.raises(RunError, match=r"result\.npz: damaged"):
+    folder = new_run('replay', tmp_path)
+    save_run(folder, result, kind='replay', seed=0, configuration={})
+    (folder / 'result.npz').write_bytes(b'not a result')
+    with pytest.raises(RunError, match=r'result\.npz: damaged'):
         load_run(folder)
 
 
 def test_without_truth_or_estimates_figures_are_unknown_and_not_zero():
     nothing = replay([], NoisyFilter(ROBOT))
-    assert np.isnan(summary_of(nothing)["translation_mae_m"])
+    assert np.isnan(summary_of(nothing)['translation_mae_m'])
     assert np.isnan(nothing.real_time_factor)
-    assert np.isnan(distribution(np.empty(0))["p99"])
+    assert np.isnan(distribution(np.empty(0))['p99'])

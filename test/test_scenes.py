@@ -1,25 +1,24 @@
 """Scenes: closed, of the stated size, with free way for the robot, and with exact truth of their anomalies."""
 
-import numpy as np
-import pytest
-import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator import convex, mesh_import, scene_cache
 from continuum_loc.simulator.mesh_import import check_mesh
 from continuum_loc.simulator.raycast import RayCaster
 from continuum_loc.simulator.scene import Anomaly, Scene, SceneError
 from continuum_loc.simulator.scenes import load_scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+import trimesh
 
-VARIANTS = ("S2", "S5", "S9")  # one of each kind: added objects, missing features, both
+VARIANTS = ('S2', 'S5', 'S9')  # one of each kind: added objects, missing features, both
 CUBE = trimesh.creation.box((1.0, 1.0, 1.0))
 
 
 def corridor(step: float = 0.02) -> np.ndarray:
     """Points of the straight engine robot over its whole insertion."""
-    robot = load_robot("engine")
+    robot = load_robot('engine')
     along = np.arange(0.0, robot.length + robot.base.insertion.range[1], step)
     return np.array(robot.base.xyz) + along[:, None] * robot.base.T_map_base[:3, 0]
 
@@ -30,16 +29,26 @@ def as_trimesh(scene) -> trimesh.Trimesh:
 
 def scene_of_mesh(vertices: np.ndarray, faces: np.ndarray) -> Scene:
     zeros = np.zeros(len(faces), dtype=np.int32)
-    return Scene("mesh", np.array(vertices), np.array(faces, dtype=np.int32), zeros, ("mesh",), zeros + 0.5, ())
+    return Scene(
+        'mesh',
+        np.array(vertices),
+        np.array(faces, dtype=np.int32),
+        zeros,
+        ('mesh',),
+        zeros + 0.5,
+        (),
+    )
 
 
 def points_inside(anomaly: Anomaly, count: int = 5000) -> np.ndarray:
     low, high = anomaly.vertices.min(axis=0), anomaly.vertices.max(axis=0)
     points = np.random.default_rng(0).uniform(low, high, (count, 3))
-    return points[RayCaster(scene_of_mesh(anomaly.vertices, anomaly.faces)).clearance(points) < -1e-4]
+    return points[
+        RayCaster(scene_of_mesh(anomaly.vertices, anomaly.faces)).clearance(points) < -1e-4
+    ]
 
 
-@pytest.mark.parametrize("name", ["S0", *VARIANTS, "R0", "R4"])
+@pytest.mark.parametrize('name', ['S0', *VARIANTS, 'R0', 'R4'])
 def test_scene_is_closed_and_within_the_face_limit(name):
     mesh = as_trimesh(load_scene(name))
     assert mesh.is_watertight and mesh.is_winding_consistent
@@ -49,90 +58,118 @@ def test_scene_is_closed_and_within_the_face_limit(name):
 
 
 def test_engine_is_3_1_m_across_with_its_axis_along_x():
-    extent = np.ptp(load_scene("S0").vertices, axis=0)
+    extent = np.ptp(load_scene('S0').vertices, axis=0)
     np.testing.assert_allclose(extent[1:], 3.1, atol=1e-3)
 
 
 def test_a_blade_row_looks_the_same_after_a_pitch_up_to_its_mistuning():
     """The symmetry that misleads an estimate without strain: the next blade is within a few millimetres."""
-    scene = load_scene("S0")
+    scene = load_scene('S0')
     caster = RayCaster(scene)
-    of_rotor = np.array([name.startswith("rotor1") for name in scene.objects])[scene.face_object]
-    radius, azimuth = (g.ravel() for g in np.meshgrid(np.linspace(0.6, 1.4, 30), np.radians(np.linspace(0, 20, 60))))
+    of_rotor = np.array([name.startswith('rotor1') for name in scene.objects])[scene.face_object]
+    radius, azimuth = (
+        g.ravel()
+        for g in np.meshgrid(np.linspace(0.6, 1.4, 30), np.radians(np.linspace(0, 20, 60)))
+    )
 
     def look_downstream(turn: float) -> tuple[np.ndarray, np.ndarray]:
-        origins = np.stack([np.full_like(radius, 0.8), radius * np.sin(azimuth + turn),
-                            radius * np.cos(azimuth + turn)], axis=1)
+        origins = np.stack(
+            [
+                np.full_like(radius, 0.8),
+                radius * np.sin(azimuth + turn),
+                radius * np.cos(azimuth + turn),
+            ],
+            axis=1,
+        )
         distance, face, _ = caster.cast(origins, np.tile([1.0, 0.0, 0.0], (len(radius), 1)))
         return distance, (face >= 0) & of_rotor[face]
 
-    (here, hit_here), (next_blade, hit_next) = look_downstream(0.0), look_downstream(2.0 * np.pi / 16)
+    (here, hit_here), (next_blade, hit_next) = (
+        look_downstream(0.0),
+        look_downstream(2.0 * np.pi / 16),
+    )
     both = hit_here & hit_next
     assert both.mean() > 0.2
     assert 1e-4 < np.median(np.abs(here[both] - next_blade[both])) < 0.01
 
 
 def test_robot_has_free_way_through_the_engine():
-    robot = load_robot("engine")
-    clearance = RayCaster(load_scene("S0")).clearance(corridor())
+    robot = load_robot('engine')
+    clearance = RayCaster(load_scene('S0')).clearance(corridor())
     assert clearance.min() > robot.radius + 0.03
     before_the_last_rows = corridor()[:, 0] < 1.45
-    assert clearance[before_the_last_rows].min() > robot.radius + 0.10  # room to bend by a decimetre
+    assert (
+        clearance[before_the_last_rows].min() > robot.radius + 0.10
+    )  # room to bend by a decimetre
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize('name', VARIANTS)
 def test_volume_is_conserved_between_a_variant_and_the_engine_as_built(name):
     scene = load_scene(name)
-    solids = {kind: sum(trimesh.Trimesh(a.vertices, a.faces).volume for a in scene.anomalies if a.kind == kind)
-              for kind in ("added", "missing")}
-    difference = as_trimesh(scene).volume - as_trimesh(load_scene("S0")).volume
-    assert difference == pytest.approx(solids["added"] - solids["missing"], rel=0.02, abs=2e-7)
+    solids = {
+        kind: sum(
+            trimesh.Trimesh(a.vertices, a.faces).volume for a in scene.anomalies if a.kind == kind
+        )
+        for kind in ('added', 'missing')
+    }
+    difference = as_trimesh(scene).volume - as_trimesh(load_scene('S0')).volume
+    assert difference == pytest.approx(solids['added'] - solids['missing'], rel=0.02, abs=2e-7)
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize('name', VARIANTS)
 def test_anomalies_are_matter_in_one_scene_and_free_space_in_the_other(name):
-    scene, variant, built = load_scene(name), RayCaster(load_scene(name)), RayCaster(load_scene("S0"))
+    scene, variant, built = (
+        load_scene(name),
+        RayCaster(load_scene(name)),
+        RayCaster(load_scene('S0')),
+    )
     for anomaly in scene.anomalies:
         inside = points_inside(anomaly)
         assert len(inside) > 100
-        matter, free = (variant, built) if anomaly.kind == "added" else (built, variant)
+        matter, free = (variant, built) if anomaly.kind == 'added' else (built, variant)
         assert np.mean(matter.clearance(inside) <= 1e-5) > 0.99, anomaly.name
         assert np.mean(free.clearance(inside) >= -1e-5) > 0.99, anomaly.name
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize('name', VARIANTS)
 def test_anomalies_are_3_to_15_cm_long_and_seen_from_the_robots_way(name):
     scene = load_scene(name)
     for anomaly in scene.anomalies:
         assert 0.03 <= anomaly.size <= 0.15, anomaly.name
-        caster = RayCaster(scene if anomaly.kind == "added" else load_scene("S0"))
-        targets = trimesh.sample.sample_surface(trimesh.Trimesh(anomaly.vertices, anomaly.faces), 50, seed=0)[0]
+        caster = RayCaster(scene if anomaly.kind == 'added' else load_scene('S0'))
+        targets = trimesh.sample.sample_surface(
+            trimesh.Trimesh(anomaly.vertices, anomaly.faces), 50, seed=0
+        )[0]
         eyes = corridor(0.1)
         rays = targets[:, None] - eyes
         distance = np.linalg.norm(rays, axis=-1)
-        hit, _, _ = caster.cast(np.tile(eyes, (len(targets), 1)), (rays / distance[..., None]).reshape(-1, 3))
+        hit, _, _ = caster.cast(
+            np.tile(eyes, (len(targets), 1)), (rays / distance[..., None]).reshape(-1, 3)
+        )
         seen = (np.abs(hit.reshape(distance.shape) - distance) < 1e-3) & (distance < 1.5)
         assert seen.any(axis=1).mean() > 0.1, anomaly.name
 
 
 def test_each_face_belongs_to_the_part_that_made_it():
     """Rays from the robot's way onto an added object land on faces of that name."""
-    scene = load_scene("S2")
+    scene = load_scene('S2')
     caster = RayCaster(scene)
-    wrench = next(a for a in scene.anomalies if a.name == "wrench")
+    wrench = next(a for a in scene.anomalies if a.name == 'wrench')
     eye = wrench.centre + [0.0, 0.0, 0.4]
     _, face, normal = caster.cast(eye[None], np.array([[0.0, 0.0, -1.0]]))
-    assert scene.objects[scene.face_object[face[0]]] == "wrench"
+    assert scene.objects[scene.face_object[face[0]]] == 'wrench'
     assert normal[0, 2] > 0.9
 
 
 def test_contact_pieces_follow_the_surface_that_sensors_see():
     """No convex piece reaches farther into free space than a third of the robot's radius."""
-    scene = load_scene("S0")
+    scene = load_scene('S0')
     caster = RayCaster(scene)
     for hull in scene.hulls:
         points = trimesh.sample.sample_surface(trimesh.convex.convex_hull(hull), 300, seed=0)[0]
-        reachable = points[np.hypot(points[:, 1], points[:, 2]) < 1.46]  # short of rub strips and ports
+        reachable = points[
+            np.hypot(points[:, 1], points[:, 2]) < 1.46
+        ]  # short of rub strips and ports
         if len(reachable):
             assert caster.clearance(reachable).max() < 0.0067
 
@@ -140,36 +177,36 @@ def test_contact_pieces_follow_the_surface_that_sensors_see():
 def test_box_measures_70_by_70_by_60_cm_inside():
     centre = np.tile([0.1, 0.1, 0.3], (6, 1))
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    distance, _, normal = RayCaster(load_scene("R0")).cast(centre, axes)
+    distance, _, normal = RayCaster(load_scene('R0')).cast(centre, axes)
     np.testing.assert_allclose(distance, [0.25, 0.25, 0.30, 0.45, 0.45, 0.30], atol=1e-6)
     np.testing.assert_allclose(normal, -axes, atol=1e-12)
 
 
 def test_each_box_scene_has_one_more_object_and_room_for_the_arm():
-    robot = load_robot("soft_arm")
+    robot = load_robot('soft_arm')
     arm = np.array(robot.base.xyz) - np.linspace(0.06, robot.length, 60)[:, None] * [0.0, 0.0, 1.0]
-    names = ["mustard_bottle", "cup", "cracker_box", "wet_floor_sign"]
+    names = ['mustard_bottle', 'cup', 'cracker_box', 'wet_floor_sign']
     for count in range(5):
-        scene = load_scene(f"R{count}")
+        scene = load_scene(f'R{count}')
         assert [anomaly.name for anomaly in scene.anomalies] == names[:count]
         assert RayCaster(scene).clearance(arm).min() > robot.radius + 0.02
 
 
 def test_box_objects_stand_on_the_floor_inside_the_box():
-    for anomaly in load_scene("R4").anomalies:
+    for anomaly in load_scene('R4').anomalies:
         assert anomaly.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
         assert np.abs(anomaly.vertices[:, :2]).max() < 0.35
         assert anomaly.vertices[:, 2].max() < 0.60
 
 
 def test_loaded_scenes_are_shared_and_cannot_be_changed():
-    scene = load_scene("R1")
-    assert load_scene("R1") is scene
-    with pytest.raises(ValueError, match="read-only"):
+    scene = load_scene('R1')
+    assert load_scene('R1') is scene
+    with pytest.raises(ValueError, match='read-only'):
         scene.vertices[0] = 0.0
 
 
-@pytest.mark.parametrize("name", ["S10", "R5", "engine", "scene.step"])
+@pytest.mark.parametrize('name', ['S10', 'R5', 'engine', 'scene.step'])
 def test_unknown_scene_is_refused_with_the_valid_names(name):
     with pytest.raises(SceneError, match=rf"no scene '{name}'.*S0.*R4.*\.stl"):
         load_scene(name)
@@ -178,66 +215,74 @@ def test_unknown_scene_is_refused_with_the_valid_names(name):
 # The cache of built scenes.
 
 
-def small_scene(name: str = "small") -> Scene:
+def small_scene(name: str = 'small') -> Scene:
     zeros = np.zeros(12, dtype=np.int32)
     vertices, faces = np.array(CUBE.vertices), np.array(CUBE.faces, dtype=np.int32)
-    anomaly = Anomaly("lump", "added", vertices.copy(), faces.copy())
-    return Scene(name, vertices, faces, zeros, ("cube",), np.full(12, 0.5), (vertices[:4].copy(), vertices[2:].copy()),
-                 (anomaly, anomaly))
+    anomaly = Anomaly('lump', 'added', vertices.copy(), faces.copy())
+    return Scene(
+        name,
+        vertices,
+        faces,
+        zeros,
+        ('cube',),
+        np.full(12, 0.5),
+        (vertices[:4].copy(), vertices[2:].copy()),
+        (anomaly, anomaly),
+    )
 
 
 def test_cache_gives_back_the_scene_and_builds_it_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    source = tmp_path / "generator.py"
-    source.write_text("v1")
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    source = tmp_path / 'generator.py'
+    source.write_text('v1')
     built = []
 
     def build() -> Scene:
         built.append(1)
         return small_scene()
 
-    first, second = (scene_cache.cached_scene("small", [source], build) for _ in range(2))
+    first, second = (scene_cache.cached_scene('small', [source], build) for _ in range(2))
     assert len(built) == 1
     np.testing.assert_array_equal(first.vertices, second.vertices)
     np.testing.assert_array_equal(first.hulls[1], second.hulls[1])
-    assert len(second.hulls) == 2 and second.objects == ("cube",)
-    assert second.anomalies[1].kind == "added" and second.anomalies[1].faces.shape == (12, 3)
-    source.write_text("v2")
-    scene_cache.cached_scene("small", [source], build)
+    assert len(second.hulls) == 2 and second.objects == ('cube',)
+    assert second.anomalies[1].kind == 'added' and second.anomalies[1].faces.shape == (12, 3)
+    source.write_text('v2')
+    scene_cache.cached_scene('small', [source], build)
     assert len(built) == 2  # a changed generator never meets an old entry
 
 
 def test_cache_entry_cut_short_is_built_again(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    scene_cache.cached_scene("small", [], small_scene)
-    entry = next(scene_cache.cache_folder().glob("*.npz"))
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    scene_cache.cached_scene('small', [], small_scene)
+    entry = next(scene_cache.cache_folder().glob('*.npz'))
     entry.write_bytes(entry.read_bytes()[:200])
-    assert scene_cache.cached_scene("small", [], small_scene).faces.shape == (12, 3)
+    assert scene_cache.cached_scene('small', [], small_scene).faces.shape == (12, 3)
 
 
 def test_no_cache_folder_costs_time_only(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert scene_cache.cached_scene("small", [], small_scene).name == "small"
+    (tmp_path / 'file').write_text('in the way')
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'file'))
+    assert scene_cache.cached_scene('small', [], small_scene).name == 'small'
 
 
 # A user's own mesh.
 
 
 def test_own_mesh_becomes_a_scene_with_contact_pieces(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    CUBE.export(tmp_path / "cube.stl")
-    scene = load_scene(tmp_path / "cube.stl")
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    CUBE.export(tmp_path / 'cube.stl')
+    scene = load_scene(tmp_path / 'cube.stl')
     assert len(scene.hulls) == 1
     np.testing.assert_allclose(np.abs(scene.hulls[0]), 0.5, atol=0.02)
 
 
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+@pytest.mark.parametrize('suffix', ['stl', 'obj', 'ply'])
 def test_every_format_keeps_the_geometry(tmp_path, monkeypatch, suffix):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(mesh_import, "convex_pieces", lambda *_: ())
-    CUBE.export(tmp_path / f"cube.{suffix}")
-    mesh = as_trimesh(load_scene(tmp_path / f"cube.{suffix}"))
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    monkeypatch.setattr(mesh_import, 'convex_pieces', lambda *_: ())
+    CUBE.export(tmp_path / f'cube.{suffix}')
+    mesh = as_trimesh(load_scene(tmp_path / f'cube.{suffix}'))
     assert len(mesh.vertices) == 8 and mesh.is_watertight
     assert mesh.volume == pytest.approx(1.0)
 
@@ -251,38 +296,38 @@ def test_room_given_by_its_inner_surface_gets_walls_outside_it():
 
 
 def test_mesh_that_cannot_be_decomposed_is_refused_and_does_not_end_the_process(monkeypatch):
-    monkeypatch.setattr(convex, "_MODULE", "continuum_loc.no_such_module")
-    with pytest.raises(SceneError, match=r"part\.stl: cannot be split .* No module named"):
-        convex.convex_pieces(CUBE.vertices, CUBE.faces, "part.stl")
+    monkeypatch.setattr(convex, '_MODULE', 'continuum_loc.no_such_module')
+    with pytest.raises(SceneError, match=r'part\.stl: cannot be split .* No module named'):
+        convex.convex_pieces(CUBE.vertices, CUBE.faces, 'part.stl')
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\nfoo", b"solid x\nendsolid x\n"])
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+@pytest.mark.parametrize('content', [b'', b'ply\nfoo', b'solid x\nendsolid x\n'])
+@pytest.mark.parametrize('suffix', ['stl', 'obj', 'ply'])
 def test_file_that_is_no_mesh_is_refused_by_name(tmp_path, content, suffix):
-    path = tmp_path / f"broken.{suffix}"
+    path = tmp_path / f'broken.{suffix}'
     path.write_bytes(content)
-    with pytest.raises(SceneError, match=r"broken"):
+    with pytest.raises(SceneError, match=r'broken'):
         load_scene(path)
 
 
 def test_cloud_of_points_is_no_scene(tmp_path):
-    path = tmp_path / "points.ply"
+    path = tmp_path / 'points.ply'
     trimesh.PointCloud(CUBE.vertices).export(path)
-    with pytest.raises(SceneError, match="no faces; export a triangle mesh"):
+    with pytest.raises(SceneError, match='no faces; export a triangle mesh'):
         load_scene(path)
 
 
 def test_absent_file_is_refused(tmp_path):
-    with pytest.raises(SceneError, match="no such file"):
-        load_scene(tmp_path / "absent.stl")
+    with pytest.raises(SceneError, match='no such file'):
+        load_scene(tmp_path / 'absent.stl')
 
 
 @given(st.sets(st.integers(0, 11), min_size=1, max_size=11))
 @settings(max_examples=50, deadline=None)
 def test_any_faces_removed_leave_a_hole_that_is_reported(removed):
     faces = np.delete(CUBE.faces, sorted(removed), axis=0)
-    with pytest.raises(SceneError, match=r"part\.stl: \d+ open edges, holes near .* close them"):
-        check_mesh(CUBE.vertices, faces, "part.stl")
+    with pytest.raises(SceneError, match=r'part\.stl: \d+ open edges, holes near .* close them'):
+        check_mesh(CUBE.vertices, faces, 'part.stl')
 
 
 @given(st.sets(st.integers(0, 11), min_size=1, max_size=11))
@@ -290,31 +335,37 @@ def test_any_faces_removed_leave_a_hole_that_is_reported(removed):
 def test_any_faces_turned_over_are_reported(turned):
     faces = CUBE.faces.copy()
     faces[sorted(turned)] = faces[sorted(turned)][:, ::-1]
-    with pytest.raises(SceneError, match="look opposite ways"):
-        check_mesh(CUBE.vertices, faces, "part.stl")
+    with pytest.raises(SceneError, match='look opposite ways'):
+        check_mesh(CUBE.vertices, faces, 'part.stl')
 
 
 @given(st.floats(1e-6, 1e6))
 @settings(max_examples=100, deadline=None)
 def test_size_is_accepted_from_5_cm_to_50_m(scale):
     if 0.05 <= scale <= 50.0:
-        check_mesh(CUBE.vertices * scale, CUBE.faces, "part.stl")
+        check_mesh(CUBE.vertices * scale, CUBE.faces, 'part.stl')
     else:
-        advice = "scale it by 0.001" if 50.0 < scale <= 50_000.0 else "must lie between"
+        advice = 'scale it by 0.001' if 50.0 < scale <= 50_000.0 else 'must lie between'
         with pytest.raises(SceneError, match=advice):
-            check_mesh(CUBE.vertices * scale, CUBE.faces, "part.stl")
+            check_mesh(CUBE.vertices * scale, CUBE.faces, 'part.stl')
 
 
 def test_degenerate_faces_are_counted_and_placed():
-    vertices = np.concatenate([CUBE.vertices, [[0.5, 0.5, 0.2]]])  # on an edge: a face without area
-    corner, other = (int(np.argmin(np.linalg.norm(vertices - [0.5, 0.5, z], axis=1))) for z in (-0.5, 0.5))
+    vertices = np.concatenate(
+        [CUBE.vertices, [[0.5, 0.5, 0.2]]]
+    )  # on an edge: a face without area
+    corner, other = (
+        int(np.argmin(np.linalg.norm(vertices - [0.5, 0.5, z], axis=1))) for z in (-0.5, 0.5)
+    )
     faces = np.concatenate([CUBE.faces, [[corner, other, 8]]])
-    with pytest.raises(SceneError, match=r"1 degenerate faces without area, the first is face 12 at \(0\.500"):
-        check_mesh(vertices, faces, "part.stl")
+    with pytest.raises(
+        SceneError, match=r'1 degenerate faces without area, the first is face 12 at \(0\.500'
+    ):
+        check_mesh(vertices, faces, 'part.stl')
 
 
 def test_vertex_that_is_not_finite_is_named():
     vertices = CUBE.vertices.copy()
     vertices[3, 1] = np.nan
-    with pytest.raises(SceneError, match="vertex 3"):
-        check_mesh(vertices, CUBE.faces, "part.stl")
+    with pytest.raises(SceneError, match='vertex 3'):
+        check_mesh(vertices, CUBE.faces, 'part.stl')

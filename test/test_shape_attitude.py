@@ -1,21 +1,20 @@
 """Attitude from IMU samples: known tilts, gravity's silence on yaw, the gate, and what the printed form gets wrong."""
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
-
 from continuum_loc import lie
 from continuum_loc.measurements import nanoseconds
 from continuum_loc.shape.attitude import (
-    GRAVITY,
     AttitudeSettings,
-    EulerFilter,
-    GravityFilter,
     euler_rates,
+    EulerFilter,
+    GRAVITY,
+    GravityFilter,
     level,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 UP = np.array([0.0, 0.0, 1.0])
 DT = nanoseconds(0.01)
@@ -47,7 +46,9 @@ def test_gravity_levels_and_never_yaws(vector):
     previous = wrong.copy()
     for k in range(1, 1400):
         R = attitude.update(k * DT, np.zeros(3), resting(true)).copy()
-        assert abs(lie.so3_log(R @ previous.T)[2]) < 1e-12, "a correction turned about the vertical"
+        assert abs(lie.so3_log(R @ previous.T)[2]) < 1e-12, (
+            'a correction turned about the vertical'
+        )
         previous = R
     np.testing.assert_allclose(R.T @ UP, true.T @ UP, atol=1e-6)
 
@@ -66,13 +67,16 @@ def test_level_is_the_least_turn_onto_gravity(prior, vector):
 
 def test_gyro_alone_integrates_a_turn_to_second_order():
     """A smooth turn of 129 degrees about one axis, past 90 degrees of pitch, with the gate shut."""
+
     def error(steps):
         attitude = started(np.eye(3), gate=1e-9)
         times = np.linspace(0.0, 1.0, steps + 1)
         rate = np.radians(129) * 30 * times**2 * (1 - times) ** 2
         for t, w in zip(times[1:], rate[1:], strict=True):
             attitude.update(nanoseconds(t), np.array([0.0, w, 0.0]), np.zeros(3))
-        return lie.rotation_error_deg(attitude.R_map_imu, lie.so3_exp(np.array([0.0, np.radians(129), 0.0])))
+        return lie.rotation_error_deg(
+            attitude.R_map_imu, lie.so3_exp(np.array([0.0, np.radians(129), 0.0]))
+        )
 
     assert error(100) < 1e-3
     assert error(50) < 1e-2
@@ -108,8 +112,11 @@ def test_stated_covariance_is_the_spread_over_many_runs():
     for _ in range(400):
         attitude = started(np.eye(3), gyro_sigma, accel_sigma, bias_sigma=0.0)
         for k in range(1, 501):
-            attitude.update(2 * k * DT, gyro_sigma * rng.standard_normal(3),
-                            resting(np.eye(3)) + accel_sigma * rng.standard_normal(3))
+            attitude.update(
+                2 * k * DT,
+                gyro_sigma * rng.standard_normal(3),
+                resting(np.eye(3)) + accel_sigma * rng.standard_normal(3),
+            )
         found.append(lie.so3_log(attitude.R_map_imu))
     spread = np.std(found, axis=0)
     np.testing.assert_allclose(spread[:2] / attitude.tilt_sigma, 1.0, atol=0.2)
@@ -127,10 +134,12 @@ def test_rotation_between_samples_follows_the_last_rate():
 # The paper's form
 
 
-@pytest.mark.parametrize(("axis", "sign"), [("roll", 1), ("roll", -1), ("pitch", 1), ("pitch", -1)])
+@pytest.mark.parametrize(
+    ('axis', 'sign'), [('roll', 1), ('roll', -1), ('pitch', 1), ('pitch', -1)]
+)
 def test_mended_euler_form_reads_a_known_tilt(axis, sign):
     """Its convention against a tilt that is known: 50 degrees about x or y."""
-    vector = np.radians(50.0 * sign) * np.array([axis == "roll", axis == "pitch", 0.0])
+    vector = np.radians(50.0 * sign) * np.array([axis == 'roll', axis == 'pitch', 0.0])
     true = lie.so3_exp(vector)
     euler = EulerFilter()
     euler.update(0, np.zeros(3), resting(true))
@@ -144,13 +153,17 @@ def test_printed_forms_read_it_wrong():
         euler = EulerFilter(**printed)
         return euler.update(0, np.zeros(3), resting(true))
 
-    assert lie.rotation_error_deg(read(pitched, pitch_as_printed=True), pitched) == pytest.approx(100.0)
-    assert lie.rotation_error_deg(read(rolled, quadrant_as_printed=True), rolled) == pytest.approx(180.0)
+    assert lie.rotation_error_deg(read(pitched, pitch_as_printed=True), pitched) == pytest.approx(
+        100.0
+    )
+    assert lie.rotation_error_deg(read(rolled, quadrant_as_printed=True), rolled) == pytest.approx(
+        180.0
+    )
     assert lie.rotation_error_deg(read(pitched, swap_as_printed=True), pitched) > 60.0
 
 
 def test_printed_yaw_decays_to_nothing():
-    true = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    true = Rotation.from_euler('z', 40, degrees=True).as_matrix()
     for printed, left in ((True, 0.0), (False, np.radians(40.0))):
         euler = EulerFilter(yaw_as_printed=printed)
         euler.update(0, np.zeros(3), resting(true))
@@ -165,10 +178,10 @@ def test_printed_yaw_decays_to_nothing():
 def test_euler_rates_are_the_derivative_of_the_angles(roll, pitch, yaw, rate):
     """Eq. 4 against the angles of R exp(rate h), away from its singularity."""
     angles, h = np.array([roll, pitch, yaw]), 1e-6
-    R = Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
+    R = Rotation.from_euler('ZYX', angles[::-1]).as_matrix()
 
     def after(step):
-        return Rotation.from_matrix(R @ lie.so3_exp(rate * step)).as_euler("ZYX")[::-1]
+        return Rotation.from_matrix(R @ lie.so3_exp(rate * step)).as_euler('ZYX')[::-1]
 
     difference = (after(h) - after(-h) + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(euler_rates(angles, rate), difference / (2 * h), atol=1e-4)
@@ -176,5 +189,7 @@ def test_euler_rates_are_the_derivative_of_the_angles(roll, pitch, yaw, rate):
 
 def test_euler_rates_grow_without_bound_at_90_degrees_of_pitch():
     rate = np.array([0.0, 0.0, 1.0])
-    near, nearer = (abs(euler_rates(np.array([0.0, np.radians(90 - d), 0.0]), rate)[2]) for d in (1.0, 0.01))
+    near, nearer = (
+        abs(euler_rates(np.array([0.0, np.radians(90 - d), 0.0]), rate)[2]) for d in (1.0, 0.01)
+    )
     assert nearer / near == pytest.approx(100.0, rel=1e-2)

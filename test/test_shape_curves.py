@@ -1,17 +1,16 @@
 """Curves: exact on what they are made for, whole on S-shapes and in space, and straight without failing."""
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from continuum_loc import lie
 from continuum_loc.robot import load_robot
 from continuum_loc.shape import curves
 from continuum_loc.shape.paper import printed_quadratic_bezier
-from continuum_loc.shape.simulate import PERFECT, Arm, bent, out_of_plane, s_shape
+from continuum_loc.shape.simulate import Arm, bent, out_of_plane, PERFECT, s_shape
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
 
-ROBOT = load_robot("hall_arm")
+ROBOT = load_robot('hall_arm')
 ARM = Arm(ROBOT, PERFECT)
 S = np.array([0.0, 0.025, 0.05, 0.075])
 FRACTIONS = np.linspace(0.0, 1.0, 301)
@@ -33,7 +32,7 @@ def errors(points, truth):
 @settings(max_examples=40, deadline=None)
 def test_arc_is_exact_on_arcs(curvature, azimuth, projected):
     points, tangents, truth = sampled(bent(ROBOT, curvature, azimuth))
-    curve = curves.fit_curve(points, tangents, "kasa_arc", projected, samples=2001)
+    curve = curves.fit_curve(points, tangents, 'kasa_arc', projected, samples=2001)
     assert errors(curve, truth).max() < 2e-7
     circle = curves.kasa_circle(curves.project(points))
     assert circle[2] == pytest.approx(1.0 / curvature, rel=1e-9)
@@ -50,17 +49,19 @@ def test_quadratic_bezier_converges_on_an_arc_with_the_fourth_power_of_the_angle
     worst = []
     for curvature in (5.0, 10.0):
         points, tangents, truth = sampled(bent(ROBOT, curvature))
-        curve = curves.fit_curve(points, tangents, "quadratic_bezier", True, samples=4001)
+        curve = curves.fit_curve(points, tangents, 'quadratic_bezier', True, samples=4001)
         # The nearest point, so that only the shape counts.
         gap = np.linalg.norm(curve[:, None] - truth[None], axis=2).min(axis=0)
-        radius = np.hypot(*(curves.project(curve) - curves.kasa_circle(curves.project(truth))[:2]).T)
+        radius = np.hypot(
+            *(curves.project(curve) - curves.kasa_circle(curves.project(truth))[:2]).T
+        )
         worst.append(np.abs(radius * curvature - 1.0).max())
         assert gap.max() < 1e-4
     assert worst[1] / worst[0] == pytest.approx(16.0, rel=0.05)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("projected", [True, False])
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('projected', [True, False])
 def test_straight_is_a_line(method, projected):
     points, tangents, truth = sampled(bent(ROBOT, 0.0))
     curve = curves.fit_curve(points, tangents, method, projected)
@@ -72,7 +73,9 @@ def nearly_straight(noise):
     points, tangents, truth = sampled(bent(ROBOT, 0.0))
     noise = np.array(noise)
     points = points + np.vstack([np.zeros(3), noise[:9].reshape(3, 3)])
-    tangents = tangents + np.column_stack([np.zeros(4), np.append(0.0, noise[9:12]), np.append(0.0, noise[12:15])])
+    tangents = tangents + np.column_stack(
+        [np.zeros(4), np.append(0.0, noise[9:12]), np.append(0.0, noise[12:15])]
+    )
     return points, tangents / np.linalg.norm(tangents, axis=1, keepdims=True), truth
 
 
@@ -96,33 +99,47 @@ def test_the_projected_forms_do_not_fail_on_noise(noise, method):
 
 
 def test_the_projected_arc_takes_a_zigzag_for_a_bend():
-    """Distances from the axis are never negative, so noise about it reads as a one-sided zigzag, for which Kasa's
-    algebraic fit prefers a small circle: 0.1 mm of noise becomes 1 mm. The spatial arc does not fall for it."""
-    points, tangents, truth = nearly_straight([0, 0, 7.0e-5, 0, 0, 4.2e-5, 0, 9.5e-5, 5.5e-5, *[0.0] * 6])
-    projected, spatial = (errors(curves.fit_curve(points, tangents, "kasa_arc", flat), truth).max()
-                          for flat in (True, False))
+    """
+    Distances from the axis are never negative, so noise about it reads as a one-sided zigzag, for
+    which Kasa's
+    algebraic fit prefers a small circle: 0.1 mm of noise becomes 1 mm. The spatial arc does not
+    fall for it.
+    """
+    points, tangents, truth = nearly_straight(
+        [0, 0, 7.0e-5, 0, 0, 4.2e-5, 0, 9.5e-5, 5.5e-5, *[0.0] * 6]
+    )
+    projected, spatial = (
+        errors(curves.fit_curve(points, tangents, 'kasa_arc', flat), truth).max()
+        for flat in (True, False)
+    )
     assert projected > 8e-4
     assert spatial < 2e-4
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("strain", "name"), [(s_shape(ROBOT, 35.0), "S"), (out_of_plane(ROBOT, 15.0, np.pi), "space")])
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize(
+    ('strain', 'name'), [(s_shape(ROBOT, 35.0), 'S'), (out_of_plane(ROBOT, 15.0, np.pi), 'space')]
+)
 def test_spatial_forms_hold_where_the_projection_folds(method, strain, name):
     points, tangents, truth = sampled(strain)
     spatial = errors(curves.fit_curve(points, tangents, method), truth).mean()
     projected = errors(curves.fit_curve(points, tangents, method, projected=True), truth).mean()
     assert spatial < 4e-4
-    assert spatial < 0.5 * projected or name == "S" and method == "cubic_bezier"
+    assert spatial < 0.5 * projected or name == 'S' and method == 'cubic_bezier'
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("strain", [bent(ROBOT, 20.0, 0.4), s_shape(ROBOT, 25.0), out_of_plane(ROBOT, 15.0)])
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize(
+    'strain', [bent(ROBOT, 20.0, 0.4), s_shape(ROBOT, 25.0), out_of_plane(ROBOT, 15.0)]
+)
 def test_spatial_forms_do_not_depend_on_the_frame(method, strain):
     points, tangents, _ = sampled(strain)
     T = lie.exp(np.array([0.1, -0.2, 0.05, 0.7, -1.1, 0.4]))
     R, p = T[:3, :3], T[:3, 3]
     moved = curves.fit_curve(points @ R.T + p, tangents @ R.T, method)
-    np.testing.assert_allclose(moved, curves.fit_curve(points, tangents, method) @ R.T + p, atol=1e-12)
+    np.testing.assert_allclose(
+        moved, curves.fit_curve(points, tangents, method) @ R.T + p, atol=1e-12
+    )
 
 
 def test_tangent_continuous_forms_keep_the_measured_tangents():
@@ -144,8 +161,10 @@ def test_printed_kappa_points_the_wrong_way():
     """Tangents of a quarter circle meet at its corner; eq. 14 as printed puts the control point opposite."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 3.0, 0.0]])
     tangents = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    mended = curves.fit_curve(points, tangents, "quadratic_bezier", projected=True, samples=5)
-    np.testing.assert_allclose(mended[1], [0.75, 0.25, 0.0])  # (p0 + 2 beta + p1) / 4 with beta = (1, 0)
+    mended = curves.fit_curve(points, tangents, 'quadratic_bezier', projected=True, samples=5)
+    np.testing.assert_allclose(
+        mended[1], [0.75, 0.25, 0.0]
+    )  # (p0 + 2 beta + p1) / 4 with beta = (1, 0)
     printed = printed_quadratic_bezier(points, tangents, 5)
     np.testing.assert_allclose(printed[1], [-0.25, 0.25, 0.0])
 
@@ -156,7 +175,12 @@ def test_an_arc_is_carried_on_as_the_same_arc(curvature, azimuth, length):
     points, tangents, _ = sampled(bent(ROBOT, curvature, azimuth))
     curve = curves.extended(curves.fit_curve(points, tangents, samples=601), length)
     angle = curvature * length
-    tip = np.array([np.sin(angle), *(1 - np.cos(angle)) * np.array([np.cos(azimuth), np.sin(azimuth)])]) / curvature
+    tip = (
+        np.array(
+            [np.sin(angle), *(1 - np.cos(angle)) * np.array([np.cos(azimuth), np.sin(azimuth)])]
+        )
+        / curvature
+    )
     np.testing.assert_allclose(curve[-1], tip, atol=2e-6)
     assert curves.arclength(curve)[-1] == pytest.approx(length, rel=1e-5)
 
@@ -169,11 +193,13 @@ def test_a_curve_that_is_long_enough_stays_as_it_is():
 
 def test_bad_input_is_named():
     points, tangents, _ = sampled(bent(ROBOT, 5.0))
-    with pytest.raises(ValueError, match="no curve 'spline'; valid: quadratic_bezier, cubic_bezier, kasa_arc"):
-        curves.fit_curve(points, tangents, "spline")
-    with pytest.raises(ValueError, match="expected points and tangents"):
+    with pytest.raises(
+        ValueError, match="no curve 'spline'; valid: quadratic_bezier, cubic_bezier, kasa_arc"
+    ):
+        curves.fit_curve(points, tangents, 'spline')
+    with pytest.raises(ValueError, match='expected points and tangents'):
         curves.fit_curve(points, tangents[:3])
-    with pytest.raises(ValueError, match="exactly 4 points"):
-        curves.fit_curve(points[:3], tangents[:3], "cubic_bezier")
-    with pytest.raises(ValueError, match="coincide"):
+    with pytest.raises(ValueError, match='exactly 4 points'):
+        curves.fit_curve(points[:3], tangents[:3], 'cubic_bezier')
+    with pytest.raises(ValueError, match='coincide'):
         curves.kasa_circle(np.ones((4, 2)))

@@ -1,13 +1,7 @@
 """The magnet's field, against closed forms and direct integration, and its inverse problem."""
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import Bounds, least_squares, minimize
-
 from continuum_loc import lie
-from continuum_loc.robot import Magnet, load_robot
+from continuum_loc.robot import load_robot, Magnet
 from continuum_loc.shape.magnet import (
     dipole_field,
     dipole_moment,
@@ -16,10 +10,18 @@ from continuum_loc.shape.magnet import (
     ring_field,
     with_moment,
 )
-from continuum_loc.shape.observations import field_residual_and_jacobian, gravity_residual_and_jacobian
+from continuum_loc.shape.observations import (
+    field_residual_and_jacobian,
+    gravity_residual_and_jacobian,
+)
 from continuum_loc.shape.position import PositionSolver
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.optimize import Bounds, least_squares, minimize
 
-MAGNET = load_robot("hall_arm").magnet
+MAGNET = load_robot('hall_arm').magnet
 ARCLENGTHS = np.array([0.025, 0.050, 0.075])
 
 distances = st.floats(0.02, 0.1)
@@ -29,7 +31,9 @@ azimuths = st.floats(-3.14, 3.14)
 
 
 def spherical(distance, angle, azimuth):
-    return distance * np.array([np.cos(angle), np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth)])
+    return distance * np.array(
+        [np.cos(angle), np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth)]
+    )
 
 
 def test_ring_on_axis_is_the_textbook_formula():
@@ -40,24 +44,36 @@ def test_ring_on_axis_is_the_textbook_formula():
         ratio = ends / np.hypot(ends, radius)
         return ratio[:, 0] - ratio[:, 1]
 
-    expected = MAGNET.remanence / 2 * (disc_pair(MAGNET.outer_diameter / 2) - disc_pair(MAGNET.inner_diameter / 2))
+    expected = (
+        MAGNET.remanence
+        / 2
+        * (disc_pair(MAGNET.outer_diameter / 2) - disc_pair(MAGNET.inner_diameter / 2))
+    )
     got = ring_field(MAGNET, np.column_stack([x, 0 * x, 0 * x]))
     np.testing.assert_allclose(got[:, 0], expected, rtol=1e-11)
     np.testing.assert_allclose(got[:, 1:], 0.0, atol=1e-18)
 
 
-@pytest.mark.parametrize("p", [(0.02, 0.015, 0.01), (0.01, 0.03, -0.02), (-0.03, 0.01, 0.002), (0.0, 0.02, 0.0)])
+@pytest.mark.parametrize(
+    'p', [(0.02, 0.015, 0.01), (0.01, 0.03, -0.02), (-0.03, 0.01, 0.002), (0.0, 0.02, 0.0)]
+)
 def test_ring_off_axis_is_the_integral_over_its_charged_faces(p):
     nodes, weights = np.polynomial.legendre.leggauss(24)
     inner, outer = MAGNET.inner_diameter / 2, MAGNET.outer_diameter / 2
     r = 0.5 * (outer + inner) + 0.5 * (outer - inner) * nodes
     angle = np.arange(256) / 256 * 2 * np.pi
-    R, A = np.meshgrid(r, angle, indexing="ij")
-    area = np.broadcast_to((0.5 * (outer - inner) * weights * r)[:, None] * 2 * np.pi / 256, R.shape)
+    R, A = np.meshgrid(r, angle, indexing='ij')
+    area = np.broadcast_to(
+        (0.5 * (outer - inner) * weights * r)[:, None] * 2 * np.pi / 256, R.shape
+    )
     expected = np.zeros(3)
     for sign in (1.0, -1.0):
-        away = np.array(p) - np.stack([np.full_like(R, sign * MAGNET.length / 2), R * np.cos(A), R * np.sin(A)], -1)
-        expected += sign * (area[..., None] * away / np.linalg.norm(away, axis=-1, keepdims=True) ** 3).sum((0, 1))
+        away = np.array(p) - np.stack(
+            [np.full_like(R, sign * MAGNET.length / 2), R * np.cos(A), R * np.sin(A)], -1
+        )
+        expected += sign * (
+            area[..., None] * away / np.linalg.norm(away, axis=-1, keepdims=True) ** 3
+        ).sum((0, 1))
     expected *= MAGNET.remanence / (4 * np.pi)
     np.testing.assert_allclose(ring_field(MAGNET, np.array(p)), expected, rtol=1e-10, atol=1e-15)
 
@@ -66,7 +82,10 @@ def test_ring_tends_to_the_dipole_as_the_square_of_its_size_over_distance():
     directions = np.array([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
 
     def gap(distance):
-        ring, dipole = ring_field(MAGNET, distance * directions), dipole_field(MAGNET, distance * directions)
+        ring, dipole = (
+            ring_field(MAGNET, distance * directions),
+            dipole_field(MAGNET, distance * directions),
+        )
         return np.linalg.norm(ring - dipole, axis=1) / np.linalg.norm(dipole, axis=1)
 
     np.testing.assert_allclose(gap(0.4) / gap(0.2), 0.25, rtol=0.02)
@@ -75,8 +94,11 @@ def test_ring_tends_to_the_dipole_as_the_square_of_its_size_over_distance():
 def test_dipole_on_axis_and_on_the_equator():
     magnet = with_moment(MAGNET, 0.836)
     assert dipole_moment(magnet) == pytest.approx(0.836)
-    np.testing.assert_allclose(dipole_field(magnet, np.array([[0.05, 0, 0], [0, 0.05, 0]])),
-                               [[2e-7 * 0.836 / 0.05**3, 0, 0], [-1e-7 * 0.836 / 0.05**3, 0, 0]], atol=1e-18)
+    np.testing.assert_allclose(
+        dipole_field(magnet, np.array([[0.05, 0, 0], [0, 0.05, 0]])),
+        [[2e-7 * 0.836 / 0.05**3, 0, 0], [-1e-7 * 0.836 / 0.05**3, 0, 0]],
+        atol=1e-18,
+    )
 
 
 def test_the_ring_is_no_dipole_at_the_modules():
@@ -86,14 +108,20 @@ def test_the_ring_is_no_dipole_at_the_modules():
     np.testing.assert_allclose((read - ARCLENGTHS) * 1e3, [0.59, 0.21, 0.13], atol=0.006)
 
 
-@given(distances, polar, azimuths, st.sampled_from(["ring", "dipole"]))
+@given(distances, polar, azimuths, st.sampled_from(['ring', 'dipole']))
 @settings(max_examples=60, deadline=None)
 def test_gradient_is_that_of_a_source_free_field(distance, angle, azimuth, model):
     p = spherical(distance, angle, azimuth)
     _, gradient = field_and_gradient(MAGNET, p, model)
     h = 1e-6
-    columns = [(field_and_gradient(MAGNET, p + h * e, model)[0] - field_and_gradient(MAGNET, p - h * e, model)[0])
-               / (2 * h) for e in np.eye(3)]
+    columns = [
+        (
+            field_and_gradient(MAGNET, p + h * e, model)[0]
+            - field_and_gradient(MAGNET, p - h * e, model)[0]
+        )
+        / (2 * h)
+        for e in np.eye(3)
+    ]
     scale = np.abs(gradient).max()
     np.testing.assert_allclose(gradient, np.column_stack(columns), atol=1e-6 * scale)
     assert abs(np.trace(gradient)) < 1e-12 * scale
@@ -113,11 +141,20 @@ def test_opposite_positions_have_one_field():
     np.testing.assert_allclose(ring_field(MAGNET, -p), ring_field(MAGNET, p), rtol=1e-12)
 
 
-@given(st.lists(st.tuples(st.floats(0.8, 1.0), st.floats(0.0, 1.45), azimuths), min_size=3, max_size=3),
-       st.sampled_from(["ring", "dipole"]))
+@given(
+    st.lists(
+        st.tuples(st.floats(0.8, 1.0), st.floats(0.0, 1.45), azimuths), min_size=3, max_size=3
+    ),
+    st.sampled_from(['ring', 'dipole']),
+)
 @settings(max_examples=60, deadline=None)
 def test_positions_come_back_from_their_fields(places, model):
-    p = np.array([spherical(s * share, angle, az) for s, (share, angle, az) in zip(ARCLENGTHS, places, strict=True)])
+    p = np.array(
+        [
+            spherical(s * share, angle, az)
+            for s, (share, angle, az) in zip(ARCLENGTHS, places, strict=True)
+        ]
+    )
     fit = PositionSolver(MAGNET, ARCLENGTHS, model).solve(field_and_gradient(MAGNET, p, model)[0])
     np.testing.assert_allclose(fit.position, p, atol=1e-9)
     assert fit.converged.all() and not fit.ambiguous.any()
@@ -133,9 +170,15 @@ def test_optimum_on_the_bounds_is_the_constrained_one():
     assert fit.converged.all() and fit.interior.tolist() == [False, False, True]
     for m in range(3):
         size = np.linalg.norm(field[m])
-        scipy = least_squares(lambda q, m=m, size=size: (ring_field(MAGNET, q) - field[m]) / size,
-                              [0.02, 0.001, 0.001], bounds=(solver.lower[m], solver.upper[m]), x_scale=0.01,
-                              xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        scipy = least_squares(
+            lambda q, m=m, size=size: (ring_field(MAGNET, q) - field[m]) / size,
+            [0.02, 0.001, 0.001],
+            bounds=(solver.lower[m], solver.upper[m]),
+            x_scale=0.01,
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+        )
         np.testing.assert_allclose(fit.position[m], scipy.x, atol=1e-6)
 
 
@@ -153,9 +196,14 @@ def test_agrees_with_the_interior_point_minimiser():
             error = (b - field[m]) / size
             return error @ error, 2 * gradient.T @ error / size / 1e3
 
-        scipy = minimize(cost, 1.05e3 * p[m], jac=True, method="trust-constr",
-                         bounds=Bounds(1e3 * solver.lower[m], 1e3 * solver.upper[m]),
-                         options={"gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-12, "maxiter": 500})
+        scipy = minimize(
+            cost,
+            1.05e3 * p[m],
+            jac=True,
+            method='trust-constr',
+            bounds=Bounds(1e3 * solver.lower[m], 1e3 * solver.upper[m]),
+            options={'gtol': 1e-12, 'xtol': 1e-12, 'barrier_tol': 1e-12, 'maxiter': 500},
+        )
         np.testing.assert_allclose(fit.position[m], scipy.x / 1e3, atol=1e-6)
 
 
@@ -165,33 +213,37 @@ def test_covariance_is_what_many_noisy_solutions_spread():
     p = np.array([[0.0234, 0.0076, 0.0], [0.038, 0.0274, 0.0], [0.0382, 0.052, 0.0]])
     solver, sigma, attitude = PositionSolver(MAGNET, ARCLENGTHS), 1e-6, np.radians(0.3)
     field = ring_field(MAGNET, p)
-    covariance, observable = solver.covariance(p, field, sigma, np.stack([attitude**2 * np.eye(3)] * 3))
+    covariance, observable = solver.covariance(
+        p, field, sigma, np.stack([attitude**2 * np.eye(3)] * 3)
+    )
     turns = attitude * rng.standard_normal((2000, 3, 3))
     # A rotation error phi of the module turns what it measured.
     noisy = field + np.cross(turns, field) + sigma * rng.standard_normal((2000, 3, 3))
     found = np.stack([solver.solve(b, p).position for b in noisy]) - p
-    spread = np.einsum("kmi,kmi->mi", found, found) / len(found)
-    np.testing.assert_allclose(spread / np.diagonal(covariance, axis1=1, axis2=2)[:, :3], 1.0, atol=0.16)
-    cross = np.einsum("kmi,kmj->mij", found, turns) / len(found)
-    scale = np.sqrt(np.einsum("mi,mj->mij", spread, np.full((3, 3), attitude**2)))
+    spread = np.einsum('kmi,kmi->mi', found, found) / len(found)
+    np.testing.assert_allclose(
+        spread / np.diagonal(covariance, axis1=1, axis2=2)[:, :3], 1.0, atol=0.16
+    )
+    cross = np.einsum('kmi,kmj->mij', found, turns) / len(found)
+    scale = np.sqrt(np.einsum('mi,mj->mij', spread, np.full((3, 3), attitude**2)))
     np.testing.assert_allclose((cross - covariance[:, :3, 3:]) / scale, 0.0, atol=0.12)
     assert observable.all()
 
 
 def test_equatorial_plane_is_told_as_unobservable():
-    solver = PositionSolver(MAGNET, ARCLENGTHS, "dipole")
+    solver = PositionSolver(MAGNET, ARCLENGTHS, 'dipole')
     p = np.array([[0.0, 0.024, 0.0], [0.0, 0.049, 0.0], [0.05, 0.03, 0.0]])
     attitude = np.stack([np.radians(0.5) ** 2 * np.eye(3)] * 3)
     field = dipole_field(MAGNET, p)
-    singular = np.linalg.svd(field_and_gradient(MAGNET, p, "dipole")[1])[1]
-    assert (singular[:2, 2] < 1e-9 * singular[:2, 0]).all(), "the gradient has rank 2 there"
+    singular = np.linalg.svd(field_and_gradient(MAGNET, p, 'dipole')[1])[1]
+    assert (singular[:2, 2] < 1e-9 * singular[:2, 0]).all(), 'the gradient has rank 2 there'
     assert solver.covariance(p, field, 1e-6, attitude)[1].tolist() == [False, False, True]
 
 
 def test_saturated_field_has_no_position():
     field = np.full((3, 3), 1e-3)
     field[0, 0] = np.nan
-    with pytest.raises(ValueError, match="finite field"):
+    with pytest.raises(ValueError, match='finite field'):
         PositionSolver(MAGNET, ARCLENGTHS).solve(field)
 
 
@@ -200,12 +252,18 @@ def test_saturated_field_has_no_position():
 def test_vector_observations_differentiate_on_the_right(seed):
     rng = np.random.default_rng(seed)
     T_map_magnet = lie.exp(rng.normal(size=6) * [0.1, 0.1, 0.1, 1, 1, 1])
-    T = T_map_magnet @ lie.exp(np.concatenate([spherical(0.05, rng.uniform(0, 1.4), 1.0), rng.normal(size=3)]))
+    T = T_map_magnet @ lie.exp(
+        np.concatenate([spherical(0.05, rng.uniform(0, 1.4), 1.0), rng.normal(size=3)])
+    )
     earth = rng.normal(size=3) * 3e-5
 
     def numeric(function, h=1e-6):
-        return np.column_stack([(function(T @ lie.exp(h * e)) - function(T @ lie.exp(-h * e))) / (2 * h)
-                                for e in np.eye(6)])
+        return np.column_stack(
+            [
+                (function(T @ lie.exp(h * e)) - function(T @ lie.exp(-h * e))) / (2 * h)
+                for e in np.eye(6)
+            ]
+        )
 
     def field(pose):
         return field_residual_and_jacobian(pose, MAGNET, T_map_magnet, np.zeros(3), earth)
@@ -215,8 +273,11 @@ def test_vector_observations_differentiate_on_the_right(seed):
 
     for observe in (field, gravity):
         _, jacobian = observe(T)
-        np.testing.assert_allclose(jacobian, numeric(lambda pose, observe=observe: observe(pose)[0]),
-                                   atol=1e-6 * np.abs(jacobian).max())
+        np.testing.assert_allclose(
+            jacobian,
+            numeric(lambda pose, observe=observe: observe(pose)[0]),
+            atol=1e-6 * np.abs(jacobian).max(),
+        )
 
 
 def test_vector_observations_take_batches():
@@ -229,5 +290,5 @@ def test_vector_observations_take_batches():
 
 
 def test_unknown_model_names_the_valid_ones():
-    with pytest.raises(ValueError, match="valid: ring, dipole"):
-        field_and_gradient(Magnet(), np.zeros(3), "disc")
+    with pytest.raises(ValueError, match='valid: ring, dipole'):
+        field_and_gradient(Magnet(), np.zeros(3), 'disc')

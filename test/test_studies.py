@@ -1,38 +1,55 @@
 """Campaigns lose no trial and repeat none; the split is kept; benchmarks and tuning judge as they say."""
 
+from dataclasses import replace
 import json
 import math
-from dataclasses import replace
-
-import numpy as np
-import pytest
 
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.evaluation import campaign
-from continuum_loc.evaluation.bench import BenchError, BenchOutcome, bound_claims, duration, run_bench, write_baseline
+from continuum_loc.evaluation.bench import (
+    BenchError,
+    BenchOutcome,
+    bound_claims,
+    duration,
+    run_bench,
+    write_baseline,
+)
 from continuum_loc.evaluation.campaign import Outcome, run_campaign
 from continuum_loc.evaluation.error_tables import condition_table, figures, mean, trial_rows
-from continuum_loc.evaluation.split import HOLD_OUT, SplitError, is_hold_out, require_unseen
+from continuum_loc.evaluation.split import HOLD_OUT, is_hold_out, require_unseen, SplitError
 from continuum_loc.evaluation.studies import table2, table3
 from continuum_loc.evaluation.studies._soft_arm import soft_arm_trials
 from continuum_loc.evaluation.trials import Trial
-from continuum_loc.evaluation.tune import TuneError, cost, scaled
+from continuum_loc.evaluation.tune import cost, scaled, TuneError
 from continuum_loc.settings import SettingsError
+import numpy as np
+import pytest
 
 
 def outcome(trial, translation=0.001, rotation=0.1, lost=0):
-    rings = {name: {"translation_mae_m": translation * k, "translation_rmse_m": translation * k,
-                    "rotation_mae_deg": rotation, "rotation_rmse_deg": rotation, "translation_max_m": translation,
-                    "nees_per_dof": 1.0, "coverage_95": 0.95} for k, name in enumerate(("ring1", "ring2"), start=1)}
-    return Outcome(trial, {"rings": rings, "estimates": {"all": 10, "lost": lost}})
+    rings = {
+        name: {
+            'translation_mae_m': translation * k,
+            'translation_rmse_m': translation * k,
+            'rotation_mae_deg': rotation,
+            'rotation_rmse_deg': rotation,
+            'translation_max_m': translation,
+            'nees_per_dof': 1.0,
+            'coverage_95': 0.95,
+        }
+        for k, name in enumerate(('ring1', 'ring2'), start=1)
+    }
+    return Outcome(trial, {'rings': rings, 'estimates': {'all': 10, 'lost': lost}})
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope='module')
 def done(tmp_path_factory):
-    out = tmp_path_factory.mktemp("campaign")
-    trials = [Trial("soft_arm", "R0", "b1", "R0", seed=3, duration=0.4),
-              Trial("soft_arm", "R0", "b1", "R1", seed=3, duration=0.4),
-              Trial("soft_arm", "R0", "no such trajectory", "R0", seed=3, duration=0.4)]
+    out = tmp_path_factory.mktemp('campaign')
+    trials = [
+        Trial('soft_arm', 'R0', 'b1', 'R0', seed=3, duration=0.4),
+        Trial('soft_arm', 'R0', 'b1', 'R1', seed=3, duration=0.4),
+        Trial('soft_arm', 'R0', 'no such trajectory', 'R0', seed=3, duration=0.4),
+    ]
     return out, trials, run_campaign(trials, out, jobs=1)
 
 
@@ -40,53 +57,65 @@ def test_one_failed_trial_is_reported_and_takes_no_other_along(done):
     _, trials, outcomes = done
     assert [outcome.trial for outcome in outcomes] == trials
     assert [outcome.summary is None for outcome in outcomes] == [False, False, True]
-    assert "no such trajectory" in outcomes[2].error
+    assert 'no such trajectory' in outcomes[2].error
 
 
 def test_trials_that_differ_in_the_map_alone_share_one_bag(done):
     out, _, _ = done
-    assert len(list((out / "bags").iterdir())) == 1
-    assert len(list((out / "trials").iterdir())) == 2
+    assert len(list((out / 'bags').iterdir())) == 1
+    assert len(list((out / 'trials').iterdir())) == 2
 
 
 def test_an_interrupted_campaign_continues(done, monkeypatch):
     out, trials, before = done
-    monkeypatch.setattr("continuum_loc.evaluation.replay.replay", None)  # a repeated estimation would fail
+    monkeypatch.setattr(
+        'continuum_loc.evaluation.replay.replay', None
+    )  # a repeated estimation would fail
     again = run_campaign(trials[:2], out, jobs=1)
-    assert [one.summary["digest"] for one in again] == [one.summary["digest"] for one in before[:2]]
+    assert [one.summary['digest'] for one in again] == [
+        one.summary['digest'] for one in before[:2]
+    ]
 
 
 def test_other_settings_are_estimated_anew(done):
     out, trials, before = done
     other = run_campaign(trials[:1], out, settings=EstimatorSettings(window=0.5))
-    assert other[0].summary["configuration_digest"] != before[0].summary["configuration_digest"]
+    assert other[0].summary['configuration_digest'] != before[0].summary['configuration_digest']
 
 
 def test_two_processes_give_what_one_gives(done, tmp_path):
     _, trials, before = done
     again = run_campaign(trials[:2], tmp_path, jobs=2)
-    assert [one.summary["digest"] for one in again] == [one.summary["digest"] for one in before[:2]]
+    assert [one.summary['digest'] for one in again] == [
+        one.summary['digest'] for one in before[:2]
+    ]
 
 
 def test_a_dask_cluster_gives_what_one_process_gives(done, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="Dask is an optional extra")
+    distributed = pytest.importorskip('distributed', reason='Dask is an optional extra')
     _, trials, before = done
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
         token = campaign.SCHEDULER.set(cluster.scheduler_address)
         try:
             again = run_campaign(trials[:2], tmp_path)
         finally:
             campaign.SCHEDULER.reset(token)
-    assert [one.summary["digest"] for one in again] == [one.summary["digest"] for one in before[:2]]
+    assert [one.summary['digest'] for one in again] == [
+        one.summary['digest'] for one in before[:2]
+    ]
 
 
 def test_a_scheduler_that_is_not_there_is_named(done, tmp_path, monkeypatch):
-    pytest.importorskip("distributed", reason="Dask is an optional extra")
+    pytest.importorskip('distributed', reason='Dask is an optional extra')
     _, trials, _ = done
-    monkeypatch.setattr(campaign, "CONNECT_LIMIT", 1)
-    token = campaign.SCHEDULER.set("tcp://127.0.0.1:1")
+    monkeypatch.setattr(campaign, 'CONNECT_LIMIT', 1)
+    token = campaign.SCHEDULER.set('tcp://127.0.0.1:1')
     try:
-        with pytest.raises(campaign.CampaignError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:1"):
+        with pytest.raises(
+            campaign.CampaignError, match=r'no Dask scheduler at tcp://127\.0\.0\.1:1'
+        ):
             run_campaign(trials[:1], tmp_path)
     finally:
         campaign.SCHEDULER.reset(token)
@@ -96,16 +125,16 @@ def test_a_failure_while_estimating_leaves_its_traceback(done, monkeypatch, tmp_
     _, trials, _ = done
 
     def broken(*arguments):
-        raise RuntimeError("solver on fire")
+        raise RuntimeError('solver on fire')
 
-    monkeypatch.setattr(campaign, "_run", broken)
+    monkeypatch.setattr(campaign, '_run', broken)
     failed = campaign._estimate(tmp_path, trials[0], None)
-    assert failed.error == "RuntimeError: solver on fire"
-    assert "Traceback" in (tmp_path / "trials" / trials[0].name / "error.txt").read_text()
+    assert failed.error == 'RuntimeError: solver on fire'
+    assert 'Traceback' in (tmp_path / 'trials' / trials[0].name / 'error.txt').read_text()
 
 
 def test_the_soft_arm_campaign_is_the_papers():
-    trials = [trial for trial in soft_arm_trials(False, 0) if trial.fidelity == "paper"]
+    trials = [trial for trial in soft_arm_trials(False, 0) if trial.fidelity == 'paper']
     assert len(trials) == 61
     assert len({trial.recording for trial in trials}) == 23
     assert len({(trial.map_scene, trial.scene) for trial in trials}) == 13
@@ -113,56 +142,70 @@ def test_the_soft_arm_campaign_is_the_papers():
 
 
 def test_no_claim_rests_on_the_hold_out():
-    held = replace(HOLD_OUT["engine"], seed=0)
+    held = replace(HOLD_OUT['engine'], seed=0)
     assert is_hold_out(held)
-    with pytest.raises(SplitError, match="tuned on"):
+    with pytest.raises(SplitError, match='tuned on'):
         require_unseen([held])
     # The hold-out is far off here; the claim of S0 must not see it.
-    outcomes = [outcome(Trial(scene="S0", trajectory="t1", map_scene="S0"), translation=1.0),
-                outcome(Trial(scene="S0", trajectory="t2", map_scene="S0"))]
+    outcomes = [
+        outcome(Trial(scene='S0', trajectory='t1', map_scene='S0'), translation=1.0),
+        outcome(Trial(scene='S0', trajectory='t2', map_scene='S0')),
+    ]
     claims = {claim.name: claim for claim in table2.judge(outcomes)}
-    assert claims["S0: translation MAE"].value == pytest.approx(0.15)
+    assert claims['S0: translation MAE'].value == pytest.approx(0.15)
 
 
 def test_a_lost_trial_fails_the_claims_of_its_condition():
-    outcomes = [outcome(Trial(scene="S0", trajectory="t2", map_scene="S0")),
-                Outcome(Trial(scene="S0", trajectory="t3", map_scene="S0"), None, "boom")]
+    outcomes = [
+        outcome(Trial(scene='S0', trajectory='t2', map_scene='S0')),
+        Outcome(Trial(scene='S0', trajectory='t3', map_scene='S0'), None, 'boom'),
+    ]
     claims = {claim.name: claim for claim in table2.judge(outcomes)}
-    assert not claims["S0: translation MAE"].holds
-    assert claims["trials that failed"].value == 1
-    assert math.isnan(mean(outcomes, "translation_mae_m"))
+    assert not claims['S0: translation MAE'].holds
+    assert claims['trials that failed'].value == 1
+    assert math.isnan(mean(outcomes, 'translation_mae_m'))
 
 
 def test_a_scene_that_is_16_percent_worse_than_s0_fails():
-    base = [outcome(Trial(scene="S0", trajectory=t, map_scene="S0")) for t in ("t2", "t3")]
-    worse = [outcome(Trial(scene="S8", trajectory=t, map_scene="S0"), translation=0.00116) for t in ("t2", "t3")]
+    base = [outcome(Trial(scene='S0', trajectory=t, map_scene='S0')) for t in ('t2', 't3')]
+    worse = [
+        outcome(Trial(scene='S8', trajectory=t, map_scene='S0'), translation=0.00116)
+        for t in ('t2', 't3')
+    ]
     claims = {claim.name: claim for claim in table2.judge(base + worse)}
-    assert not claims["S8: translation MAE against S0"].holds
-    assert claims["S8: rotation MAE against S0"].holds
+    assert not claims['S8: translation MAE against S0'].holds
+    assert claims['S8: rotation MAE against S0'].holds
 
 
 def test_a_trial_that_is_off_and_says_nothing_is_counted():
-    trial = Trial("soft_arm", "R1", "b2", "R1")
+    trial = Trial('soft_arm', 'R1', 'b2', 'R1')
     assert table3.silently_lost(outcome(trial, translation=0.06))
     assert not table3.silently_lost(outcome(trial, translation=0.06, lost=3))
     assert not table3.silently_lost(outcome(trial))
 
 
 def test_tables_show_mean_and_deviation_over_trials_and_rings():
-    members = [outcome(Trial(trajectory="t1"), 0.001), outcome(Trial(trajectory="t2"), 0.003)]
+    members = [outcome(Trial(trajectory='t1'), 0.001), outcome(Trial(trajectory='t2'), 0.003)]
     values = 100 * np.array([0.001, 0.002, 0.003, 0.006])
-    assert figures(members)["translation MAE [cm]"] == f"{values.mean():.2f} ± {values.std():.2f}"
-    rows = condition_table(members, "scene", lambda one: one.trial.scene, table2.PAPER)
-    assert rows[0]["paper: translation MAE [cm]"] == "0.78 ± 0.48"
-    assert len(trial_rows([*members, Outcome(Trial(), None, "boom")])) == 5
+    assert figures(members)['translation MAE [cm]'] == f'{values.mean():.2f} ± {values.std():.2f}'
+    rows = condition_table(members, 'scene', lambda one: one.trial.scene, table2.PAPER)
+    assert rows[0]['paper: translation MAE [cm]'] == '0.78 ± 0.48'
+    assert len(trial_rows([*members, Outcome(Trial(), None, 'boom')])) == 5
 
 
-def row(name="lookup", ratio=3.0, spread=(2.8, 3.2)):
-    return {"name": name, "ours_s": 1e-6, "peer": "them", "peer_s": 3e-6, "ratio": ratio, "spread": list(spread)}
+def row(name='lookup', ratio=3.0, spread=(2.8, 3.2)):
+    return {
+        'name': name,
+        'ours_s': 1e-6,
+        'peer': 'them',
+        'peer_s': 3e-6,
+        'ratio': ratio,
+        'spread': list(spread),
+    }
 
 
 def test_regressions_are_falls_beyond_slack_and_spread(tmp_path):
-    baseline = tmp_path / "baseline.json"
+    baseline = tmp_path / 'baseline.json'
     write_baseline([row()], baseline)
 
     def regressions(now):
@@ -171,47 +214,57 @@ def test_regressions_are_falls_beyond_slack_and_spread(tmp_path):
     assert regressions(row(ratio=1.5, spread=(1.4, 1.6)))
     assert not regressions(row(ratio=2.6, spread=(2.5, 2.7)))  # within the slack
     assert not regressions(row(ratio=1.5, spread=(0.5, 3.0)))  # too noisy to tell
-    assert not regressions(row(name="new", ratio=0.1, spread=(0.1, 0.1)))
-    with pytest.raises(BenchError, match="no baseline"):
-        BenchOutcome([], [], []).regressions(tmp_path / "nothing.json")
+    assert not regressions(row(name='new', ratio=0.1, spread=(0.1, 0.1)))
+    with pytest.raises(BenchError, match='no baseline'):
+        BenchOutcome([], [], []).regressions(tmp_path / 'nothing.json')
 
 
 def test_one_broken_benchmark_does_not_stop_the_others(tmp_path, monkeypatch):
-    monkeypatch.setattr("continuum_loc.evaluation.bench.BENCH_FOLDER", tmp_path)
-    (tmp_path / "a.py").write_text("def run(quick): raise OSError('no peer')")
-    (tmp_path / "b.py").write_text(f"BOUNDS = [('look', 'ratio', 'at least', 5.0)]\ndef run(quick): return [{row()!r}]")
-    found = run_bench(tmp_path / "out", quick=True)
-    assert found.failures == ["a: OSError: no peer"]
+    monkeypatch.setattr('continuum_loc.evaluation.bench.BENCH_FOLDER', tmp_path)
+    (tmp_path / 'a.py').write_text("def run(quick): raise OSError('no peer')")
+    (tmp_path / 'b.py').write_text(
+        f"BOUNDS = [('look', 'ratio', 'at least', 5.0)]\ndef run(quick): return [{row()!r}]"
+    )
+    found = run_bench(tmp_path / 'out', quick=True)
+    assert found.failures == ['a: OSError: no peer']
     assert [claim.holds for claim in found.claims] == [False]
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["failures"] == found.failures
-    assert "| lookup |" in (tmp_path / "out" / "bench.md").read_text()
-    with pytest.raises(BenchError, match="benchmarks: a, b"):
-        run_bench(tmp_path / "out", quick=True, only="c")
+    assert (
+        json.loads((tmp_path / 'out' / 'summary.json').read_text())['failures'] == found.failures
+    )
+    assert '| lookup |' in (tmp_path / 'out' / 'bench.md').read_text()
+    with pytest.raises(BenchError, match='benchmarks: a, b'):
+        run_bench(tmp_path / 'out', quick=True, only='c')
 
 
 def test_bounds_are_judged_on_the_worst_row():
     rows = [row(ratio=2.0), row(ratio=4.0)]
-    assert bound_claims(rows, [("lookup", "ratio", "at least", 3.0)])[0].value == 2.0
-    assert bound_claims(rows, [("lookup", "ours_s", "at most", 1e-5)])[0].holds
-    assert not bound_claims(rows, [("missing", "ratio", "at least", 0.0)])[0].holds
+    assert bound_claims(rows, [('lookup', 'ratio', 'at least', 3.0)])[0].value == 2.0
+    assert bound_claims(rows, [('lookup', 'ours_s', 'at most', 1e-5)])[0].holds
+    assert not bound_claims(rows, [('missing', 'ratio', 'at least', 0.0)])[0].holds
 
 
 def test_durations_have_a_unit_that_suits_them():
-    assert [duration(value) for value in (3e-9, 4.5e-6, 0.02, 3.0, None)] == ["3 ns", "4.5 us", "20 ms", "3 s", "-"]
+    assert [duration(value) for value in (3e-9, 4.5e-6, 0.02, 3.0, None)] == [
+        '3 ns',
+        '4.5 us',
+        '20 ms',
+        '3 s',
+        '-',
+    ]
 
 
 def test_tuning_cost_prefers_less_error_and_honest_covariance():
     assert cost(0.001, 0.1, 1.0) < cost(0.0011, 0.1, 1.0)
     assert cost(0.001, 0.1, 1.0) < cost(0.001, 0.1, 2.0)
     assert cost(0.001, 0.1, 2.0) == pytest.approx(cost(0.001, 0.1, 0.5))
-    assert cost(float("nan"), 0.1, 1.0) == math.inf
+    assert cost(float('nan'), 0.1, 1.0) == math.inf
 
 
 def test_settings_are_scaled_by_name():
     start = EstimatorSettings()
-    assert scaled(start, "tof.floor", 2.0).tof.floor == 2.0 * start.tof.floor
-    assert scaled(start, "prior.strain", 0.5).prior.strain[4] == 0.5 * start.prior.strain[4]
+    assert scaled(start, 'tof.floor', 2.0).tof.floor == 2.0 * start.tof.floor
+    assert scaled(start, 'prior.strain', 0.5).prior.strain[4] == 0.5 * start.prior.strain[4]
     with pytest.raises(TuneError, match=r"no setting 'tof\.flor'.*tof\.floor"):
-        scaled(start, "tof.flor", 2.0)
-    with pytest.raises(SettingsError, match="tof.min_cosine"):
-        scaled(start, "tof.min_cosine", 100.0)
+        scaled(start, 'tof.flor', 2.0)
+    with pytest.raises(SettingsError, match='tof.min_cosine'):
+        scaled(start, 'tof.min_cosine', 100.0)

@@ -1,23 +1,25 @@
-"""ToF sensors: hit geometry against analytic answers and MuJoCo's rays; noise and faults against their models.
+"""
+ToF sensors: hit geometry against analytic answers and MuJoCo's rays; noise and faults against
+their models.
 
-Statistical tests use fixed seeds and thresholds with a false-alarm rate of 1e-4 each, should the seed change.
+Statistical tests use fixed seeds and thresholds with a false-alarm rate of 1e-4 each, should the
+seed change.
 """
 
-import mujoco
-import numpy as np
-import pytest
-import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy import stats
-from scipy.spatial.transform import Rotation
-
-from continuum_loc.robot import TofModel, load_robot
-from continuum_loc.simulator.raycast import RayCaster, cast_capsules
+from continuum_loc.robot import load_robot, TofModel
+from continuum_loc.simulator.raycast import cast_capsules, RayCaster
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.tof import Echoes, TofSensorModel
 from continuum_loc.simulator.vl53l5cx import Vl53l5cxReceiver, Vl53l5cxSettings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import mujoco
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+import trimesh
 
 FALSE_ALARM = 1e-4
 MIDDLE = [27, 28, 35, 36]
@@ -27,15 +29,24 @@ IDEAL = Vl53l5cxSettings(crosstalk=0.0, dropout=0.0, inconsistent=0.0, fluctuati
 
 def scene_of_mesh(mesh: trimesh.Trimesh, reflectance: float = 0.5) -> Scene:
     count = len(mesh.faces)
-    return Scene("mesh", np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int32),
-                 np.zeros(count, np.int32), ("mesh",), np.full(count, reflectance), ())
+    return Scene(
+        'mesh',
+        np.array(mesh.vertices, dtype=float),
+        np.array(mesh.faces, dtype=np.int32),
+        np.zeros(count, np.int32),
+        ('mesh',),
+        np.full(count, reflectance),
+        (),
+    )
 
 
 def wall(distance: float, reflectance: float = 0.88, yaw_deg: float = 0.0) -> Scene:
     """A large slab whose near face crosses the x axis at a distance; yawed about that point."""
     slab = trimesh.creation.box((0.1, 40.0, 40.0))
     slab.apply_translation((0.05, 0.0, 0.0))
-    slab.apply_transform(trimesh.transformations.rotation_matrix(np.radians(yaw_deg), (0.0, 0.0, 1.0)))
+    slab.apply_transform(
+        trimesh.transformations.rotation_matrix(np.radians(yaw_deg), (0.0, 0.0, 1.0))
+    )
     slab.apply_translation((distance, 0.0, 0.0))
     return scene_of_mesh(slab, reflectance)
 
@@ -69,7 +80,9 @@ def test_rays_meet_a_sphere_within_its_faceting():
     rays = unit_rays(2000)
     along = -rays @ eye
     chord = radius**2 - (eye @ eye - along**2)
-    central = (along > 0.0) & (chord > 0.5 * radius**2)  # short of the limb, where a facet's depth is amplified
+    central = (along > 0.0) & (
+        chord > 0.5 * radius**2
+    )  # short of the limb, where a facet's depth is amplified
     distance, _, _ = RayCaster(scene_of_mesh(mesh)).cast(np.tile(eye, (2000, 1)), rays)
     expected = along[central] - np.sqrt(chord[central])
     assert central.sum() > 20
@@ -78,26 +91,34 @@ def test_rays_meet_a_sphere_within_its_faceting():
 
 
 def test_miss_is_infinite_and_has_no_face():
-    distance, face, normal = RayCaster(wall(1.0)).cast(np.zeros((1, 3)), np.array([[-1.0, 0.0, 0.0]]))
+    distance, face, normal = RayCaster(wall(1.0)).cast(
+        np.zeros((1, 3)), np.array([[-1.0, 0.0, 0.0]])
+    )
     assert np.isinf(distance[0]) and face[0] == -1 and np.isnan(normal).all()
 
 
 def test_mesh_hits_agree_with_mujoco():
-    """Embree and MuJoCo's own ray caster on a concave mesh: surfaces within a micrometre, measured square to them
-    (both keep vertices in single precision, which a grazing ray amplifies)."""
+    """
+    Embree and MuJoCo's own ray caster on a concave mesh: surfaces within a micrometre, measured
+    square to them (both keep vertices in single precision, which a grazing ray amplifies).
+    """
     mesh = trimesh.creation.torus(0.6, 0.2, major_sections=40, minor_sections=24)
     mesh.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9])))
     spec = mujoco.MjSpec()
-    spec.add_mesh(name="m", uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel())
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="m")
+    spec.add_mesh(name='m', uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel())
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname='m')
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     origins, rays = 2.0 * unit_rays(1500, 1), unit_rays(1500, 2) * 0.35
     rays = (rays - origins) / np.linalg.norm(rays - origins, axis=1, keepdims=True)
     ours, _, normal = RayCaster(scene_of_mesh(mesh)).cast(origins, rays)
-    theirs = np.array([mujoco.mj_ray(model, data, o, r, None, 1, -1, np.zeros(1, np.int32))
-                       for o, r in zip(origins, rays, strict=True)])
+    theirs = np.array(
+        [
+            mujoco.mj_ray(model, data, o, r, None, 1, -1, np.zeros(1, np.int32))
+            for o, r in zip(origins, rays, strict=True)
+        ]
+    )
     theirs = np.where(theirs < 0.0, np.inf, theirs)
     hit = np.isfinite(theirs)
     assert hit.sum() > 500
@@ -113,15 +134,21 @@ def test_capsules_agree_with_mujoco():
     capsules = np.concatenate([ends.reshape(6, 6), rng.uniform(0.02, 0.2, (6, 1))], axis=1)
     spec = mujoco.MjSpec()
     for capsule in capsules:
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=capsule[:6], size=[capsule[6], 0.0, 0.0])
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=capsule[:6], size=[capsule[6], 0.0, 0.0]
+        )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     origins, rays = 3.0 * unit_rays(1000, 4), unit_rays(1000, 5)
     rays = (rays - origins) / np.linalg.norm(rays - origins, axis=1, keepdims=True)
     ours = cast_capsules(origins, rays[:, None], capsules)[:, 0]
-    theirs = np.array([mujoco.mj_ray(model, data, o, r, None, 1, -1, np.zeros(1, np.int32))
-                       for o, r in zip(origins, rays, strict=True)])
+    theirs = np.array(
+        [
+            mujoco.mj_ray(model, data, o, r, None, 1, -1, np.zeros(1, np.int32))
+            for o, r in zip(origins, rays, strict=True)
+        ]
+    )
     assert 100 < np.isfinite(ours).sum() < 1000
     np.testing.assert_allclose(ours, np.where(theirs < 0.0, np.inf, theirs), rtol=1e-9, atol=1e-9)
 
@@ -152,14 +179,16 @@ def test_a_capsule_is_met_at_its_surface_and_never_late(eye, a, b, radius, seed)
 
 def test_culling_by_the_fans_cone_changes_nothing():
     """A whole fan at once gives what its rays give one by one."""
-    robot = load_robot("engine")
+    robot = load_robot('engine')
     rng = np.random.default_rng(8)
     origins = rng.uniform(-0.5, 0.5, (20, 3))
     fans = MODEL.directions @ Rotation.random(20, random_state=1).as_matrix().transpose(0, 2, 1)
     ends = rng.uniform(-0.6, 0.6, (60, 6))
     capsules = np.concatenate([ends, np.full((60, 1), robot.radius)], axis=1)
     together = cast_capsules(origins, fans, capsules)
-    apart = cast_capsules(np.repeat(origins, 64, axis=0), fans.reshape(-1, 1, 3), capsules).reshape(20, 64)
+    apart = cast_capsules(
+        np.repeat(origins, 64, axis=0), fans.reshape(-1, 1, 3), capsules
+    ).reshape(20, 64)
     assert np.isfinite(together).any()
     np.testing.assert_array_equal(together, apart)
 
@@ -167,57 +196,68 @@ def test_culling_by_the_fans_cone_changes_nothing():
 # Fidelity `paper`.
 
 
-@pytest.mark.parametrize("distance", [0.05, 0.4, 0.9, 2.5])
+@pytest.mark.parametrize('distance', [0.05, 0.4, 0.9, 2.5])
 def test_paper_noise_is_gaussian_with_the_deviation_of_table_1(distance):
     scene = wall(distance)
     true, _, _ = RayCaster(scene).cast(np.zeros((64, 3)), MODEL.directions)
-    frames = sensor(scene, "paper", seed=1).measure(np.tile(np.eye(4), (100, 1, 1)), ["tof"] * 100, 1)
+    frames = sensor(scene, 'paper', seed=1).measure(
+        np.tile(np.eye(4), (100, 1, 1)), ['tof'] * 100, 1
+    )
     residual = np.stack([frame.ranges - true for frame in frames]) / MODEL.sigma(true)
-    assert stats.kstest(residual.ravel(), "norm").pvalue > FALSE_ALARM
+    assert stats.kstest(residual.ravel(), 'norm').pvalue > FALSE_ALARM
     variance = residual.size * np.mean(residual**2)
     assert FALSE_ALARM / 2 < stats.chi2.cdf(variance, residual.size) < 1.0 - FALSE_ALARM / 2
 
 
-@pytest.mark.parametrize(("distance", "expected"), [(0.01, -np.inf), (4.2, np.inf)])
+@pytest.mark.parametrize(('distance', 'expected'), [(0.01, -np.inf), (4.2, np.inf)])
 def test_paper_readings_out_of_range_follow_rep_117(distance, expected):
-    frame = sensor(wall(distance), "paper").measure(np.eye(4)[None], ["tof"], 1)[0]
+    frame = sensor(wall(distance), 'paper').measure(np.eye(4)[None], ['tof'], 1)[0]
     assert np.all(frame.ranges == expected)
-    assert np.isnan(frame.points).all() and np.isnan(frame.sigma).all() and not np.any(frame.status == 5)
+    assert (
+        np.isnan(frame.points).all()
+        and np.isnan(frame.sigma).all()
+        and not np.any(frame.status == 5)
+    )
 
 
 def test_points_lie_along_the_zones_rays():
-    frame = sensor(load_scene("R4"), "paper").measure(_in_the_box()[None], ["tof"], 7)[0]
-    assert frame.stamp == 7 and frame.sensor == "tof"
+    frame = sensor(load_scene('R4'), 'paper').measure(_in_the_box()[None], ['tof'], 7)[0]
+    assert frame.stamp == 7 and frame.sensor == 'tof'
     np.testing.assert_allclose(np.linalg.norm(frame.points, axis=1), frame.ranges)
     np.testing.assert_allclose(np.cross(frame.points, MODEL.directions), 0.0, atol=1e-12)
 
 
 def test_perpendicular_convention_publishes_ranges_along_the_ray():
     """Noise acts on the distance along the optical axis; the mean range is still z / cos."""
-    model = TofModel(convention="perpendicular")
-    frames = sensor(wall(1.0), "paper", seed=2, model=model).measure(np.tile(np.eye(4), (400, 1, 1)), ["tof"] * 400, 1)
+    model = TofModel(convention='perpendicular')
+    frames = sensor(wall(1.0), 'paper', seed=2, model=model).measure(
+        np.tile(np.eye(4), (400, 1, 1)), ['tof'] * 400, 1
+    )
     depths = np.stack([frame.points[:, 0] for frame in frames])
     statistic = (depths.mean(axis=0) - 1.0) / (model.sigma(np.array(1.0)) / np.sqrt(400))
     assert np.abs(statistic).max() < stats.norm.isf(FALSE_ALARM / 128)
     np.testing.assert_allclose(frames[0].ranges * model.directions[:, 0], frames[0].points[:, 0])
 
 
-@pytest.mark.parametrize("fidelity", ["paper", "vl53l5cx"])
+@pytest.mark.parametrize('fidelity', ['paper', 'vl53l5cx'])
 def test_the_same_seed_gives_the_same_frames(fidelity):
     poses = np.stack([_in_the_box(), _in_the_box(0.4)])
-    runs = (sensor(load_scene("R4"), fidelity, seed).measure(poses, ["a", "b"], 1) for seed in (5, 5, 6))
+    runs = (
+        sensor(load_scene('R4'), fidelity, seed).measure(poses, ['a', 'b'], 1)
+        for seed in (5, 5, 6)
+    )
     for one, two, three in zip(*runs, strict=True):
         np.testing.assert_array_equal(one.ranges, two.ranges)
         np.testing.assert_array_equal(one.status, two.status)
         assert np.any(one.ranges != three.ranges)
 
 
-@pytest.mark.parametrize("fidelity", ["paper", "vl53l5cx"])
+@pytest.mark.parametrize('fidelity', ['paper', 'vl53l5cx'])
 def test_the_body_hides_what_is_behind_it(fidelity):
     body = np.array([[0.3, -1.0, 0.0, 0.3, 1.0, 0.0, 0.03]])
     tof = sensor(wall(1.0), fidelity)
-    frame = tof.measure(np.eye(4)[None], ["tof"], 1, body)[0]
-    bare = tof.measure(np.eye(4)[None], ["tof"], 1)[0]
+    frame = tof.measure(np.eye(4)[None], ['tof'], 1, body)[0]
+    bare = tof.measure(np.eye(4)[None], ['tof'], 1)[0]
     crossed = np.abs(MODEL.directions[:, 2] / MODEL.directions[:, 0] * 0.3) < 0.02
     assert crossed.sum() == 16
     assert np.all(frame.points[crossed, 0] < 0.33)
@@ -227,39 +267,43 @@ def test_the_body_hides_what_is_behind_it(fidelity):
 
 def test_a_sensor_inside_its_own_mount_looks_through_it():
     body = np.array([[-0.5, 0.0, 0.0, 0.01, 0.0, 0.0, 0.02]])
-    frame = sensor(wall(1.0), "paper").measure(np.eye(4)[None], ["tof"], 1, body)[0]
+    frame = sensor(wall(1.0), 'paper').measure(np.eye(4)[None], ['tof'], 1, body)[0]
     assert frame.ranges.min() > 0.9
 
 
 def test_poses_that_do_not_fit_the_names_are_refused():
-    with pytest.raises(ValueError, match="do not fit 2 names"):
-        sensor(wall(1.0), "paper").measure(np.eye(4)[None], ["a", "b"], 1)
+    with pytest.raises(ValueError, match='do not fit 2 names'):
+        sensor(wall(1.0), 'paper').measure(np.eye(4)[None], ['a', 'b'], 1)
 
 
 def test_unknown_fidelity_is_refused():
-    with pytest.raises(ValueError, match="paper or vl53l5cx"):
-        sensor(wall(1.0), "perfect")
+    with pytest.raises(ValueError, match='paper or vl53l5cx'):
+        sensor(wall(1.0), 'perfect')
 
 
 def test_settings_of_the_real_sensor_are_refused_where_they_would_do_nothing():
-    with pytest.raises(ValueError, match="takes no settings"):
-        TofSensorModel(MODEL, RayCaster(wall(1.0)), "paper", np.random.default_rng(0), IDEAL)
+    with pytest.raises(ValueError, match='takes no settings'):
+        TofSensorModel(MODEL, RayCaster(wall(1.0)), 'paper', np.random.default_rng(0), IDEAL)
 
 
 # Fidelity `vl53l5cx`.
 
 
-def uniform_echoes(receiver: Vl53l5cxReceiver, depth: np.ndarray, brightness: np.ndarray | float) -> Echoes:
+def uniform_echoes(
+    receiver: Vl53l5cxReceiver, depth: np.ndarray, brightness: np.ndarray | float
+) -> Echoes:
     """Echoes of one sensor from surfaces at given depths (Z, sub-rays), broadcast."""
     cosine = receiver.directions[:, 0].reshape(64, -1)
     distance = np.broadcast_to(depth, cosine.shape) / cosine
-    return Echoes(distance.reshape(1, -1), np.broadcast_to(brightness, cosine.shape).reshape(1, -1))
+    return Echoes(
+        distance.reshape(1, -1), np.broadcast_to(brightness, cosine.shape).reshape(1, -1)
+    )
 
 
 def read(receiver: Vl53l5cxReceiver, depth, brightness=0.88, frames: int = 2, seed: int = 0):
     rng = np.random.default_rng(seed)
     for _ in range(frames):
-        readings = receiver.read(uniform_echoes(receiver, depth, brightness), ["tof"], rng)
+        readings = receiver.read(uniform_echoes(receiver, depth, brightness), ['tof'], rng)
     return readings
 
 
@@ -270,22 +314,27 @@ def depths_of(readings) -> np.ndarray:
 def test_perpendicular_distance_comes_in_millimetres_with_the_stated_noise():
     receiver = Vl53l5cxReceiver(MODEL, IDEAL)
     rng, echoes = np.random.default_rng(0), uniform_echoes(receiver, 0.8, 0.88)
-    frames = [receiver.read(echoes, ["tof"], rng) for _ in range(200)]
+    frames = [receiver.read(echoes, ['tof'], rng) for _ in range(200)]
     depth = np.concatenate([depths_of(frame) for frame in frames])
     np.testing.assert_allclose(depth * 1e3, np.round(depth * 1e3), atol=1e-9)
     signal = 0.88 / 0.8**2 * np.mean(receiver.directions[:, 0] ** 2)
     faintness = 1.0 + IDEAL.threshold / signal
     light = np.hypot(MODEL.sigma(np.array(0.8)), IDEAL.noise_floor) * np.sqrt(faintness)
     deviation = np.hypot(light, 1e-3 / np.sqrt(12))
-    assert np.std(depth) == pytest.approx(deviation, rel=0.03)  # 12,800 readings: 0.6 % at one sigma
+    assert np.std(depth) == pytest.approx(
+        deviation, rel=0.03
+    )  # 12,800 readings: 0.6 % at one sigma
     assert abs(np.mean(depth) - 0.8) < 4.0 * deviation / np.sqrt(depth.size)
 
 
-@pytest.mark.parametrize(("reflectance", "reach"), [(0.88, 4.0), (0.17, 1.75)])
+@pytest.mark.parametrize(('reflectance', 'reach'), [(0.88, 4.0), (0.17, 1.75)])
 def test_reach_is_the_datasheets(reflectance, reach):
     """In the middle zones: nothing is lost at 80 % of it; beyond it nothing is seen."""
     steady = Vl53l5cxReceiver(MODEL, IDEAL)
-    within, beyond = read(steady, 0.8 * reach, reflectance), read(steady, 1.05 * reach, reflectance)
+    within, beyond = (
+        read(steady, 0.8 * reach, reflectance),
+        read(steady, 1.05 * reach, reflectance),
+    )
     assert np.isfinite(within.ranges[0, MIDDLE]).all()
     assert np.all(beyond.ranges == np.inf) and np.all(beyond.status == 255)
 
@@ -293,7 +342,9 @@ def test_reach_is_the_datasheets(reflectance, reach):
 def test_a_grazing_wall_is_lost_before_a_facing_one():
     """Reflectance 0.2 at 1 m: seen straight on, too faint at 80 degrees of incidence."""
     facing, grazing = (
-        sensor(wall(1.0, 0.2, yaw), "vl53l5cx").measure(np.eye(4)[None], ["tof"], 1)[0] for yaw in (0, 80))
+        sensor(wall(1.0, 0.2, yaw), 'vl53l5cx').measure(np.eye(4)[None], ['tof'], 1)[0]
+        for yaw in (0, 80)
+    )
     assert np.isfinite(facing.ranges[MIDDLE]).all()
     assert not np.isfinite(grazing.ranges[MIDDLE]).any()
 
@@ -309,19 +360,21 @@ def test_an_edge_gives_a_mixed_reading_between_close_surfaces():
     assert np.all(readings.status == 9)
 
 
-@pytest.mark.parametrize(("order", "expected"), [("strongest", 1.5), ("closest", 0.9)])
+@pytest.mark.parametrize(('order', 'expected'), [('strongest', 1.5), ('closest', 0.9)])
 def test_two_far_surfaces_give_the_strongest_or_the_closest(order, expected):
     """The near half is dark: 0.2 / 0.9^2 < 0.88 / 1.5^2."""
-    receiver = Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={"target_order": order}))
+    receiver = Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'target_order': order}))
     brightness = np.tile([0.2, 0.2, 0.88, 0.88], 4)[None]
-    assert np.allclose(depths_of(read(receiver, half_and_half(0.9, 1.5), brightness)), expected, atol=0.05)
+    assert np.allclose(
+        depths_of(read(receiver, half_and_half(0.9, 1.5), brightness)), expected, atol=0.05
+    )
 
 
 def test_light_of_a_bright_zone_drowns_its_faint_neighbours():
     """One zone at 5 cm leaks into eight neighbours at 2 m, which are flagged and carry no range."""
     depth = np.full((64, 1), 2.0)
     depth[27] = 0.05
-    flagged = read(Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={"crosstalk": 0.01})), depth)
+    flagged = read(Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'crosstalk': 0.01})), depth)
     around = [27 + 8 * r + c for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
     assert np.flatnonzero(flagged.status[0] == 12).tolist() == sorted(around)
     assert np.isnan(flagged.ranges[0, around]).all()
@@ -343,9 +396,9 @@ def test_too_close_is_minus_infinity():
 
 
 def test_dropouts_come_at_their_rate():
-    receiver = Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={"dropout": 0.02}))
+    receiver = Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'dropout': 0.02}))
     rng, echoes = np.random.default_rng(0), uniform_echoes(receiver, 1.0, 0.88)
-    lost = sum(int(np.sum(receiver.read(echoes, ["tof"], rng).status == 255)) for _ in range(300))
+    lost = sum(int(np.sum(receiver.read(echoes, ['tof'], rng).status == 255)) for _ in range(300))
     assert stats.binomtest(lost, 300 * 64, 0.02).pvalue > FALSE_ALARM
 
 
@@ -353,12 +406,16 @@ def test_sub_rays_fill_each_zone_and_average_to_its_ray():
     receiver = Vl53l5cxReceiver(MODEL)
     slopes = receiver.directions[:, 1:] / receiver.directions[:, :1]
     zones = slopes.reshape(64, 16, 2)
-    np.testing.assert_allclose(zones.mean(axis=1), MODEL.directions[:, 1:] / MODEL.directions[:, :1], atol=1e-12)
+    np.testing.assert_allclose(
+        zones.mean(axis=1), MODEL.directions[:, 1:] / MODEL.directions[:, :1], atol=1e-12
+    )
     width = 2.0 * np.tan(np.radians(22.5)) / 8
     np.testing.assert_allclose(np.ptp(zones, axis=1), 0.75 * width, atol=1e-12)
 
 
-@pytest.mark.parametrize("flips", [{}, {"flip_rows": True}, {"flip_columns": True, "grid": "uniform_angle"}])
+@pytest.mark.parametrize(
+    'flips', [{}, {'flip_rows': True}, {'flip_columns': True, 'grid': 'uniform_angle'}]
+)
 def test_zones_keep_their_order_under_flips_and_grids(flips):
     model = TofModel(**flips)
     zones = Vl53l5cxReceiver(model).directions.reshape(64, 16, 3).mean(axis=1)
@@ -368,14 +425,14 @@ def test_zones_keep_their_order_under_flips_and_grids(flips):
 def test_the_ideal_sensor_reduces_to_geometry():
     """In the box, zones that see one surface agree with the central ray to the noise and the slope's curvature."""
     poses = _in_the_box()[None]
-    real = sensor(load_scene("R0"), "vl53l5cx").measure(poses, ["tof"], 1)[0]
-    paper = sensor(load_scene("R0"), "paper").measure(poses, ["tof"], 1)[0]
+    real = sensor(load_scene('R0'), 'vl53l5cx').measure(poses, ['tof'], 1)[0]
+    paper = sensor(load_scene('R0'), 'paper').measure(poses, ['tof'], 1)[0]
     assert np.isfinite(real.ranges).mean() > 0.9
     assert np.nanmedian(np.abs(real.ranges - paper.ranges)) < 0.01
 
 
 def _in_the_box(yaw: float = 0.0) -> np.ndarray:
     T_map_sensor = np.eye(4)
-    T_map_sensor[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    T_map_sensor[:3, :3] = Rotation.from_euler('z', yaw).as_matrix()
     T_map_sensor[:3, 3] = [-0.1, 0.0, 0.3]
     return T_map_sensor

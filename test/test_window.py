@@ -2,25 +2,31 @@
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
-from worlds import EPOCH, Rod, rod, room_map, stream
-
 from continuum_loc import lie
-from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter, load_estimator_settings, smooth
+from continuum_loc.estimator import (
+    EstimatorSettings,
+    load_estimator_settings,
+    SlidingWindowFilter,
+    smooth,
+)
 from continuum_loc.measurements import ImuSample, TofFrame, TruthSample
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.world import World
+import numpy as np
+import pytest
+from worlds import EPOCH, Rod, rod, room_map, stream
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope='module')
 def prior_map():
     return room_map()
 
 
 def settings(**changes) -> EstimatorSettings:
-    return parse_settings(EstimatorSettings, {"knot_period": 0.1, "window": 0.6, "lag": 0.2, **changes})
+    return parse_settings(
+        EstimatorSettings, {'knot_period': 0.1, 'window': 0.6, 'lag': 0.2, **changes}
+    )
 
 
 def run(filter_: SlidingWindowFilter, samples) -> tuple[list, dict]:
@@ -37,34 +43,46 @@ def run(filter_: SlidingWindowFilter, samples) -> tuple[list, dict]:
 
 def errors(estimates, truth) -> np.ndarray:
     """(K, R + 1, 6) body-frame pose errors of the estimates that have a true pose at their stamp."""
-    return np.array([lie.log(lie.inverse(e.T_map_ring) @ truth[e.stamp]) for e in estimates if e.stamp in truth])
+    return np.array(
+        [
+            lie.log(lie.inverse(e.T_map_ring) @ truth[e.stamp])
+            for e in estimates
+            if e.stamp in truth
+        ]
+    )
 
 
 def test_tracks_the_rod_within_its_own_covariance(prior_map):
     robot = rod()
-    estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 3.0))
+    estimates, truth = run(
+        SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 3.0)
+    )
     e = errors(estimates, truth)[5:, 1:]
     assert len(estimates) == 46
     assert np.sqrt(np.mean(e[..., :3] ** 2)) < 2e-3
     assert np.degrees(np.sqrt(np.mean(e[..., 3:] ** 2))) < 0.3
     P = np.array([x.covariance for x in estimates])[5:, 1:]
-    nees = np.einsum("kri,krij,krj->kr", e, np.linalg.inv(P), e) / 6.0
+    nees = np.einsum('kri,krij,krj->kr', e, np.linalg.inv(P), e) / 6.0
     assert 0.05 < np.mean(nees) < 2.0
-    assert all(x.status == "tracking" for x in estimates[5:])
+    assert all(x.status == 'tracking' for x in estimates[5:])
 
 
 def test_velocity_is_the_bodys(prior_map):
     robot = rod()
     motion = Rod(robot, seed=2)
     estimates, _ = run(SlidingWindowFilter(robot, prior_map, settings()), stream(motion, 3.0))
-    e = np.array([x.velocity - motion.rates((x.stamp - EPOCH) / 1e9) for x in estimates[15:]])[:, 1:]
+    e = np.array([x.velocity - motion.rates((x.stamp - EPOCH) / 1e9) for x in estimates[15:]])[
+        :, 1:
+    ]
     assert np.sqrt(np.mean(e[..., :3] ** 2)) < 0.02
     assert np.sqrt(np.mean(e[..., 3:] ** 2)) < 0.05
 
 
 def test_the_smoothed_estimate_is_the_better_one(prior_map):
     robot = rod()
-    estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings(lag=0.2)), stream(Rod(robot, seed=1), 3.0))
+    estimates, truth = run(
+        SlidingWindowFilter(robot, prior_map, settings(lag=0.2)), stream(Rod(robot, seed=1), 3.0)
+    )
     lagged = [x.lagged for x in estimates if x.lagged is not None]
     lagged = [x for x in lagged if x.stamp in truth][3:]
     assert len(lagged) > 20
@@ -75,8 +93,10 @@ def test_the_smoothed_estimate_is_the_better_one(prior_map):
 
 def test_the_same_measurements_give_the_same_estimate(prior_map):
     robot = rod()
-    first, second = (run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 1.5))[0]
-                     for _ in range(2))
+    first, second = (
+        run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 1.5))[0]
+        for _ in range(2)
+    )
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a.T_map_ring, b.T_map_ring)
         np.testing.assert_array_equal(a.covariance, b.covariance)
@@ -86,15 +106,19 @@ def test_order_within_the_window_does_not_matter_and_older_data_is_dropped_and_c
     """A gyro that reports 50 ms late is still used; a sample from before the window is not."""
     robot = rod()
     samples = list(stream(Rod(robot), 2.0))
-    late = [replace(s, stamp=s.stamp) for s in samples if isinstance(s, ImuSample) and s.sensor == "r1_imu"]
-    others = [s for s in samples if not (isinstance(s, ImuSample) and s.sensor == "r1_imu")]
+    late = [
+        replace(s, stamp=s.stamp)
+        for s in samples
+        if isinstance(s, ImuSample) and s.sensor == 'r1_imu'
+    ]
+    others = [s for s in samples if not (isinstance(s, ImuSample) and s.sensor == 'r1_imu')]
     mixed = sorted(others + late, key=lambda s: s.stamp + (50_000_000 if s in late else 0))
     filter_ = SlidingWindowFilter(robot, prior_map, settings())
     estimates, truth = run(filter_, mixed)
-    assert filter_.counts["used"]["ImuSample"] == sum(isinstance(s, ImuSample) for s in samples)
+    assert filter_.counts['used']['ImuSample'] == sum(isinstance(s, ImuSample) for s in samples)
     assert np.max(np.abs(errors(estimates, truth)[5:, 1:, :3])) < 0.01
     filter_.process(samples[1])
-    assert filter_.counts["dropped"]["older than the window"] == 1
+    assert filter_.counts['dropped']['older than the window'] == 1
 
 
 def test_unusable_measurements_are_counted_and_harmless(prior_map):
@@ -103,21 +127,30 @@ def test_unusable_measurements_are_counted_and_harmless(prior_map):
     samples = list(stream(Rod(robot), 1.0))
     frame = next(s for s in samples if isinstance(s, TofFrame))
     imu = next(s for s in samples if isinstance(s, ImuSample))
-    bad = [replace(frame, sensor="nobody"), replace(frame, points=frame.points[:10]),
-           replace(imu, angular_velocity=np.array([np.nan, 0.0, 0.0])),
-           replace(imu, angular_velocity=np.array([50.0, 0.0, 0.0]))]
+    bad = [
+        replace(frame, sensor='nobody'),
+        replace(frame, points=frame.points[:10]),
+        replace(imu, angular_velocity=np.array([np.nan, 0.0, 0.0])),
+        replace(imu, angular_velocity=np.array([50.0, 0.0, 0.0])),
+    ]
     for sample in bad:
         assert filter_.process(sample) is None
     estimates, truth = run(filter_, samples)
-    assert dict(filter_.counts["dropped"]) == {"tof: unknown frame": 1, "tof: wrong size": 1, "gyro: not finite": 1,
-                                               "gyro: saturated": 1}
+    assert dict(filter_.counts['dropped']) == {
+        'tof: unknown frame': 1,
+        'tof: wrong size': 1,
+        'gyro: not finite': 1,
+        'gyro: saturated': 1,
+    }
     assert np.max(np.abs(errors(estimates, truth)[:, 1:, :3])) < 0.01
 
 
 def test_invalid_zones_carry_no_information(prior_map):
     robot = rod()
-    nothing = [replace(s, status=np.full(64, 255, np.uint8)) if isinstance(s, TofFrame) else s
-               for s in stream(Rod(robot), 1.0)]
+    nothing = [
+        replace(s, status=np.full(64, 255, np.uint8)) if isinstance(s, TofFrame) else s
+        for s in stream(Rod(robot), 1.0)
+    ]
     with_zones, _ = run(SlidingWindowFilter(robot, prior_map, settings()), stream(Rod(robot), 1.0))
     without, _ = run(SlidingWindowFilter(robot, prior_map, settings()), nothing)
     assert without[-1].covariance[2, 0, 0] > 4.0 * with_zones[-1].covariance[2, 0, 0]
@@ -126,12 +159,17 @@ def test_invalid_zones_carry_no_information(prior_map):
 def test_a_gap_is_bridged_with_growing_covariance(prior_map):
     """Half a second with gyros alone: the covariance grows, the error stays inside it, and both shrink again."""
     robot = rod()
-    samples = [s for s in stream(Rod(robot), 3.0)
-               if isinstance(s, ImuSample | TruthSample) or not 1.0 < (s.stamp - EPOCH) / 1e9 < 1.5]
+    samples = [
+        s
+        for s in stream(Rod(robot), 3.0)
+        if isinstance(s, ImuSample | TruthSample) or not 1.0 < (s.stamp - EPOCH) / 1e9 < 1.5
+    ]
     estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), samples)
     times = np.array([(e.stamp - EPOCH) / 1e9 for e in estimates])
     spread = np.array([np.sqrt(np.trace(e.covariance[2, :3, :3])) for e in estimates])
-    before, during, after = (spread[(times > a) & (times < b)] for a, b in ((0.6, 1.0), (1.3, 1.5), (2.0, 3.0)))
+    before, during, after = (
+        spread[(times > a) & (times < b)] for a, b in ((0.6, 1.0), (1.3, 1.5), (2.0, 3.0))
+    )
     assert np.max(during) > 3.0 * np.max(before)
     assert np.median(after) < 1.5 * np.median(before)
     assert np.max(np.abs(errors(estimates, truth)[-10:, 1:, :3])) < 0.01
@@ -140,21 +178,27 @@ def test_a_gap_is_bridged_with_growing_covariance(prior_map):
 def test_gyro_bias_is_found_at_rest(prior_map):
     """Within four sigmas of the rest's mean (0.01 rad/s over 50 samples, and 0.002 rad/s for rest not being rest)."""
     robot = rod()
-    bias = {"r1_imu": np.array([0.05, -0.06, 0.04]), "r2_imu": np.array([-0.05, 0.06, 0.045])}
-    biased = [replace(s, angular_velocity=s.angular_velocity + bias[s.sensor]) if isinstance(s, ImuSample) else s
-              for s in stream(Rod(robot), 2.0)]
-    filter_ = SlidingWindowFilter(robot, prior_map, settings(gyro={"bias_sigma": 0.1}))
+    bias = {'r1_imu': np.array([0.05, -0.06, 0.04]), 'r2_imu': np.array([-0.05, 0.06, 0.045])}
+    biased = [
+        replace(s, angular_velocity=s.angular_velocity + bias[s.sensor])
+        if isinstance(s, ImuSample)
+        else s
+        for s in stream(Rod(robot), 2.0)
+    ]
+    filter_ = SlidingWindowFilter(robot, prior_map, settings(gyro={'bias_sigma': 0.1}))
     run(filter_, biased)
     estimate = filter_.window.column(-1).bias
-    np.testing.assert_allclose(estimate, np.array(list(bias.values())), atol=4.0 * np.hypot(0.01 / np.sqrt(50), 0.002))
+    np.testing.assert_allclose(
+        estimate, np.array(list(bias.values())), atol=4.0 * np.hypot(0.01 / np.sqrt(50), 0.002)
+    )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize('seed', range(3))
 def test_finds_itself_from_the_base_alone(prior_map, seed):
     """Without strain and bent from the first moment: the search along the body must find the shape."""
     robot = rod(strain=False)
     motion = Rod(robot, seed=seed, amplitude=1.8)
-    filter_ = SlidingWindowFilter(robot, prior_map, settings(recovery={"max_curvature": 2.0}))
+    filter_ = SlidingWindowFilter(robot, prior_map, settings(recovery={'max_curvature': 2.0}))
     estimates, truth = run(filter_, stream(motion, 1.0, start=2.0))
     assert np.max(np.abs(errors(estimates, truth)[-5:, 1:, :3])) < 0.01
 
@@ -179,7 +223,9 @@ def test_queries_agree_with_the_estimate_and_reach_behind_and_ahead(prior_map):
     newest = estimates[-1]
     state = filter_.query(newest.stamp, 0.3)
     np.testing.assert_allclose(state.T_map_body, newest.T_map_ring[1], atol=1e-9)
-    np.testing.assert_allclose(state.covariance[:6, :6], newest.covariance[1], rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(
+        state.covariance[:6, :6], newest.covariance[1], rtol=1e-6, atol=1e-15
+    )
     for time in (0.7, 1.4, 2.5, 2.9):
         for s in (0.1, 0.25, 0.4, 0.55):
             state = filter_.query(EPOCH + round(time * 1e9), s)
@@ -189,7 +235,7 @@ def test_queries_agree_with_the_estimate_and_reach_behind_and_ahead(prior_map):
     later = [filter_.query(newest.stamp + round(dt * 1e9), 0.6) for dt in (0.0, 0.3, 0.6)]
     spreads = [np.trace(state.covariance[:3, :3]) for state in later]
     assert spreads[0] < spreads[1] < spreads[2]
-    with pytest.raises(ValueError, match="off the body; valid: 0 to 0.6 m"):
+    with pytest.raises(ValueError, match='off the body; valid: 0 to 0.6 m'):
         filter_.query(newest.stamp, 0.7)
 
 
@@ -211,29 +257,35 @@ def test_a_frozen_sensor_is_refused_and_a_wrong_extrinsic_named(prior_map):
     first: dict = {}
     samples = []
     for s in stream(Rod(robot, seed=6), 2.0):
-        if isinstance(s, TofFrame) and s.sensor == "r1_tof0":
-            s = replace(first.setdefault("frame", s), stamp=s.stamp)
-        if isinstance(s, TofFrame) and s.sensor == "r2_tof1":
+        if isinstance(s, TofFrame) and s.sensor == 'r1_tof0':
+            s = replace(first.setdefault('frame', s), stamp=s.stamp)
+        if isinstance(s, TofFrame) and s.sensor == 'r2_tof1':
             s = replace(s, points=s.points @ turn.T)
         samples.append(s)
     filter_ = SlidingWindowFilter(robot, prior_map, settings())
     estimates, truth = run(filter_, samples)
-    assert filter_.counts["dropped"]["tof: frozen"] > 20
-    assert set(estimates[-1].suspects) == {"r1_tof0", "r2_tof1"}
+    assert filter_.counts['dropped']['tof: frozen'] > 20
+    assert set(estimates[-1].suspects) == {'r1_tof0', 'r2_tof1'}
     assert np.max(np.abs(errors(estimates, truth)[-10:, 1:, :3])) < 0.01
 
 
 def test_field_gravity_and_gyros_track_the_hall_arm():
-    """The arm of the second paper, bent freely by its tendons: no map, no strain, only the magnet at its base.
+    """
+    The arm of the second paper, bent freely by its tendons: no map, no strain, only the magnet at
+    its base.
 
-    Told Earth's field it is good to 0.2 mm; not told, ten times worse, as Earth's is a tenth of the magnet's."""
-    robot = load_robot("hall_arm")
-    world = World(robot, None, "free1", seed=3)
+    Told Earth's field it is good to 0.2 mm; not told, ten times worse, as Earth's is a tenth of
+    the magnet's.
+    """
+    robot = load_robot('hall_arm')
+    world = World(robot, None, 'free1', seed=3)
     samples = list(world.run(4.0))
     median = []
     for earth in (world.plant.earth_field, (0.0, 0.0, 0.0)):
-        preset = load_estimator_settings("hall_arm")
-        told = preset.model_copy(update={"field": preset.field.model_copy(update={"earth": earth})})
+        preset = load_estimator_settings('hall_arm')
+        told = preset.model_copy(
+            update={'field': preset.field.model_copy(update={'earth': earth})}
+        )
         estimates, truth = run(SlidingWindowFilter(robot, None, told), samples)
         distance = np.linalg.norm(errors(estimates, truth)[5:, 1:, :3], axis=-1)
         assert len(distance) > 40

@@ -1,34 +1,58 @@
-"""A small analytic world for the filter's tests: a bent rod that moves by a formula, in a room of planes.
+"""
+A small analytic world for the filter's tests: a bent rod that moves by a formula, in a room of
+planes.
 
-Everything is exact and needs no simulator: constant-curvature segments between rings, rays against planes.
+Everything is exact and needs no simulator: constant-curvature segments between rings, rays against
+planes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from continuum_loc import lie
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.measurements import ImuSample, StrainSample, TofFrame, TruthSample, nanoseconds
+from continuum_loc.measurements import ImuSample, nanoseconds, StrainSample, TofFrame, TruthSample
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
+import numpy as np
 
-# Inward-looking walls of a room and of a step in it: (normal, point on the plane, corners' extent).
+# Inward-looking walls of a room and of a step in it: (normal, point on the plane, corners'
+# extent).
 ROOM = np.array([[-0.5, -0.7, -0.6], [1.3, 0.8, 0.7]])
 EPOCH = 1_000_000_000
 
 
 def rod(strain: bool = True, tof: bool = True) -> RobotDescription:
     """A rod of 0.6 m with rings at 0.3 m and 0.6 m, three radial ToF sensors each and one at the tip."""
-    sensors = [{"name": f"r{r}_tof{i}", "ring": f"r{r}", "mount": {"azimuth_deg": 60.0 * r + 120.0 * i, "radius": 0.02}}
-               for r in (1, 2) for i in range(3)]
-    sensors.append({"name": "tip_tof", "ring": "r2", "mount": {"xyz": [0.005, 0.0, 0.0], "rpy_deg": [0.0, 0.0, 0.0]}})
-    return parse_settings(RobotDescription, {
-        "name": "rod", "length": 0.6, "radius": 0.02, "rings": [{"name": "r1", "s": 0.3}, {"name": "r2", "s": 0.6}],
-        "tof": sensors if tof else [], "imu": [{"name": f"r{r}_imu", "ring": f"r{r}"} for r in (1, 2)],
-        "strain": {"spacing": 0.05} if strain else None})
+    sensors = [
+        {
+            'name': f'r{r}_tof{i}',
+            'ring': f'r{r}',
+            'mount': {'azimuth_deg': 60.0 * r + 120.0 * i, 'radius': 0.02},
+        }
+        for r in (1, 2)
+        for i in range(3)
+    ]
+    sensors.append(
+        {
+            'name': 'tip_tof',
+            'ring': 'r2',
+            'mount': {'xyz': [0.005, 0.0, 0.0], 'rpy_deg': [0.0, 0.0, 0.0]},
+        }
+    )
+    return parse_settings(
+        RobotDescription,
+        {
+            'name': 'rod',
+            'length': 0.6,
+            'radius': 0.02,
+            'rings': [{'name': 'r1', 's': 0.3}, {'name': 'r2', 's': 0.6}],
+            'tof': sensors if tof else [],
+            'imu': [{'name': f'r{r}_imu', 'ring': f'r{r}'} for r in (1, 2)],
+            'strain': {'spacing': 0.05} if strain else None,
+        },
+    )
 
 
 class Rod:
@@ -61,12 +85,14 @@ class Rod:
     def rates(self, time: float) -> np.ndarray:
         """(R + 1, 6) body velocities by central differences."""
         step = 1e-5
-        return lie.log(lie.inverse(self.rings(time - step)) @ self.rings(time + step)) / (2.0 * step)
+        return lie.log(lie.inverse(self.rings(time - step)) @ self.rings(time + step)) / (
+            2.0 * step
+        )
 
 
 def cast(origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """(N,) distances to the room's walls from inside."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide='ignore', invalid='ignore'):
         hits = (ROOM[:, None, :] - origins) / rays
     return np.min(np.where(hits > 1e-6, hits, np.inf), axis=(0, 2))
 
@@ -77,10 +103,14 @@ def room_map(spacing: float = 0.02) -> PriorMap:
     for axis in range(3):
         u, v = (i for i in range(3) if i != axis)
         ticks = (np.arange(ROOM[0, i] + 0.5 * spacing, ROOM[1, i], spacing) for i in (u, v))
-        grid = np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
+        grid = np.stack(np.meshgrid(*ticks, indexing='ij'), -1)
         for side in range(2):
             wall = np.empty((grid.shape[0] * grid.shape[1], 3))
-            wall[:, axis], wall[:, u], wall[:, v] = ROOM[side, axis], grid[..., 0].ravel(), grid[..., 1].ravel()
+            wall[:, axis], wall[:, u], wall[:, v] = (
+                ROOM[side, axis],
+                grid[..., 0].ravel(),
+                grid[..., 1].ravel(),
+            )
             normal = np.zeros(3)
             normal[axis] = 1.0 if side == 0 else -1.0
             points.append(wall)
@@ -102,7 +132,9 @@ def stream(rod_: Rod, duration: float, seed: int = 0, start: float = 0.0) -> Ite
             rates = rod_.rates(time)
             for number, imu in enumerate(robot.imu):
                 noise = robot.imu_model.gyro_sigma * rng.normal(size=3)
-                yield ImuSample(stamp, imu.name, rates[number + 1, 3:] + noise, np.array([0.0, 0.0, 9.81]))
+                yield ImuSample(
+                    stamp, imu.name, rates[number + 1, 3:] + noise, np.array([0.0, 0.0, 9.81])
+                )
         if k % 15 == 0 and robot.strain is not None:
             yield strain_sample(rod_, time, stamp, rng)
         if k % 20 == 0:
@@ -114,8 +146,12 @@ def strain_sample(rod_: Rod, time: float, stamp: int, rng: np.random.Generator) 
     bend = rod_.curvature(time)[(s > 0.3).astype(int)]
     kappa, theta = np.hypot(*bend.T), np.arctan2(-bend[:, 0], bend[:, 1])
     noise = rod_.robot.strain
-    return StrainSample(stamp, s, theta + noise.theta_sigma * rng.normal(size=len(s)),
-                        kappa + noise.kappa_sigma * rng.normal(size=len(s)))
+    return StrainSample(
+        stamp,
+        s,
+        theta + noise.theta_sigma * rng.normal(size=len(s)),
+        kappa + noise.kappa_sigma * rng.normal(size=len(s)),
+    )
 
 
 def tof_frames(rod_: Rod, time: float, stamp: int, rng: np.random.Generator) -> Iterator[TofFrame]:
@@ -127,4 +163,11 @@ def tof_frames(rod_: Rod, time: float, stamp: int, rng: np.random.Generator) -> 
         distance = cast(np.broadcast_to(T_map_sensor[:3, 3], directions.shape), directions)
         sigma = robot.tof_model.sigma(distance)
         measured = distance + sigma * rng.normal(size=len(distance))
-        yield TofFrame(stamp, sensor.name, measured[:, None] * rays, measured, sigma, np.full(len(rays), 5, np.uint8))
+        yield TofFrame(
+            stamp,
+            sensor.name,
+            measured[:, None] * rays,
+            measured,
+            sigma,
+            np.full(len(rays), 5, np.uint8),
+        )

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-__all__ = ["Estimate", "EstimatorSettings", "SlidingWindowFilter", "load_estimator_settings", "settings_of", "smooth"]
+__all__ = [
+    'Estimate',
+    'EstimatorSettings',
+    'SlidingWindowFilter',
+    'load_estimator_settings',
+    'settings_of',
+    'smooth',
+]
 
 
 def __getattr__(name: str):
-    if name == "SlidingWindowFilter":
+    if name == 'SlidingWindowFilter':
         from continuum_loc.estimator.filter import SlidingWindowFilter
 
         return SlidingWindowFilter
-    if name == "smooth":
+    if name == 'smooth':
         from continuum_loc.estimator.smoother import smooth
 
         return smooth
-    if name == "Estimate":
+    if name == 'Estimate':
         from continuum_loc.estimator.estimate import Estimate
 
         return Estimate
-    if name in ("EstimatorSettings", "load_estimator_settings", "settings_of"):
+    if name in ('EstimatorSettings', 'load_estimator_settings', 'settings_of'):
         from continuum_loc.estimator import settings
 
         return getattr(settings, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -1,4 +1,6 @@
-"""Least squares on a chain of columns: block-tridiagonal elimination, marginalisation and covariances.
+"""
+Least squares on a chain of columns: block-tridiagonal elimination, marginalisation and
+covariances.
 
 Interval k couples columns k and k + 1 by a quadratic  1/2 [x_k; x_k+1]^T H [x_k; x_k+1] + g^T [x_k; x_k+1]  in the
 columns' offsets x from their linearisation points. Eliminating columns from the oldest to the newest leaves on each
@@ -6,17 +8,17 @@ a *message* (Lambda, eta), all that the past says of it:
 
     S_k = Lambda_k + H_aa,   Lambda_k+1 = H_bb - H_ab^T S_k^-1 H_ab,   eta_k+1 = g_b - H_ab^T S_k^-1 (eta_k + g_a).
 
-Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the message it left.
-Messages before the first interval that changed are kept from the last solve, and covariances come from the same
-triangular factors; no matrix is ever inverted.
+Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the
+message it left. Messages before the first interval that changed are kept from the last solve, and
+covariances come from the same triangular factors; no matrix is ever inverted.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from numba import njit
+import numpy as np
 from scipy.linalg import blas, lapack
 
 
@@ -24,8 +26,10 @@ class SingularError(ArithmeticError):
     """An elimination met a matrix that is not positive definite; `column` says at which one."""
 
     def __init__(self, column: int):
-        super().__init__(f"the information of column {column} is not positive definite: some of its directions are "
-                         "not observed by any measurement or prior")
+        super().__init__(
+            f'the information of column {column} is not positive definite: some of its directions are '
+            'not observed by any measurement or prior'
+        )
         self.column = column
 
 
@@ -73,7 +77,9 @@ class Chain:
         self._eliminated: list[_Elimination] = []
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
-    def solve(self, intervals: list[Blocks], first_changed: int, damping: float = 0.0) -> list[np.ndarray]:
+    def solve(
+        self, intervals: list[Blocks], first_changed: int, damping: float = 0.0
+    ) -> list[np.ndarray]:
         """Offsets (D,) of all columns. Raises SingularError."""
         self._forward(intervals, first_changed, damping)
         L, y = self._last
@@ -83,10 +89,12 @@ class Chain:
         return offsets[::-1]
 
     def covariance(self, column: int, A: np.ndarray, B: np.ndarray | None = None) -> np.ndarray:
-        """Covariance (m, m) of A x + B x', with A, B (m, D), of the offsets x of a column and x' of the next one.
+        """
+        Covariance (m, m) of A x + B x', with A, B (m, D), of the offsets x of a column and x' of
+        the next one.
 
-        With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero above `column`: the
-        cost grows with the columns after it, not with the window.
+        With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero
+        above `column`: the cost grows with the columns after it, not with the window.
         """
         X = blas.dtrsm(1.0, self._factor(column), A.T, lower=1)
         covariance = blas.dsyrk(1.0, X, trans=1, lower=1)
@@ -95,16 +103,21 @@ class Chain:
             if B is not None and k == column + 1:
                 right += B.T
             X = blas.dtrsm(1.0, self._factor(k), right, lower=1)
-            covariance = blas.dsyrk(1.0, X, beta=1.0, c=covariance, trans=1, lower=1, overwrite_c=1)
+            covariance = blas.dsyrk(
+                1.0, X, beta=1.0, c=covariance, trans=1, lower=1, overwrite_c=1
+            )
         return _symmetrised(covariance)
 
     def _factor(self, column: int) -> np.ndarray:
         return self._eliminated[column].L if column < len(self._eliminated) else self._last[0]
 
     def forget_oldest(self, oldest: Blocks, changed: bool) -> None:
-        """Marginalise the oldest column through its interval: its message to the next becomes the start.
+        """
+        Marginalise the oldest column through its interval: its message to the next becomes the
+        start.
 
-        `changed` says that the interval is not the one of the last solve, so that it must be eliminated anew.
+        `changed` says that the interval is not the one of the last solve, so that it must be
+        eliminated anew.
         """
         if changed or not self._eliminated:
             self.messages[1:], self._eliminated[:] = [], []
@@ -113,7 +126,7 @@ class Chain:
 
     def _forward(self, intervals: list[Blocks], first: int, damping: float) -> None:
         first = min(first, len(self._eliminated))
-        del self.messages[first + 1:], self._eliminated[first:]
+        del self.messages[first + 1 :], self._eliminated[first:]
         for k in range(first, len(intervals)):
             self._eliminate(intervals[k], k, damping)
         newest = self.messages[-1]

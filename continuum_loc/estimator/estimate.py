@@ -7,21 +7,25 @@ from typing import Literal
 
 import numpy as np
 
-Status = Literal["initialising", "tracking", "lost"]
+Status = Literal['initialising', 'tracking', 'lost']
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The body at one instant: its base and R rings (in the robot description's order), and its backbone.
+    """
+    The body at one instant: its base and R rings (in the robot description's order), and its
+    backbone.
 
     stamp: integer ns of the instant.
     T_map_ring: (R + 1, 4, 4) poses, the base first.
-    covariance: (R + 1, 6, 6) of a right perturbation, [rho; phi] order (m, rad), in the ring's own frame.
+    covariance: (R + 1, 6, 6) of a right perturbation, [rho; phi] order (m, rad), in the ring's own
+    frame.
     strain, velocity: (R + 1, 6) body-frame generalised strain [nu; omega] and velocity [v; w].
     velocity_covariance: (R + 1, 6, 6).
     backbone_s: (B,) arclengths, evenly spaced; T_map_backbone: (B, 4, 4).
     status: `initialising` until the first consistent fit, `tracking`, or `lost`.
-    consistency: mean normalised innovation squared per measured dimension in the window (1 when honest).
+    consistency: mean normalised innovation squared per measured dimension in the window (1 when
+    honest).
     inliers: share of usable zones that fit the map, by ToF sensor.
     lagged: the same body at `stamp - lag`, smoothed by everything since; None before there is one.
     """

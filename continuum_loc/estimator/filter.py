@@ -1,54 +1,65 @@
-"""The sliding-window filter: start reading here.
+"""
+The sliding-window filter: start reading here.
 
-A measurement enters by `process`. Its stamp puts it into the interval between two knots of the `Window`; when a cycle
-of ToF frames is complete (or `output_rate` says so) the window is solved and an `Estimate` comes out. `Recovery`
-notices a body in a wrong minimum and finds it again.
+A measurement enters by `process`. Its stamp puts it into the interval between two knots of the
+`Window`; when a cycle of ToF frames is complete (or `output_rate` says so) the window is solved
+and an `Estimate` comes out. `Recovery` notices a body in a wrong minimum and finds it again.
 """
 
 from __future__ import annotations
 
-import time as clock
 from collections import Counter
 from collections.abc import Sequence
-
-import numpy as np
-from threadpoolctl import ThreadpoolController
+import time as clock
 
 from continuum_loc.estimator.chain import SingularError
 from continuum_loc.estimator.estimate import Estimate
-from continuum_loc.estimator.factors import FACTORS, Factor, MeasurementError, TofFactor
-from continuum_loc.estimator.output import BodyState, backbone
+from continuum_loc.estimator.factors import Factor, FACTORS, MeasurementError, TofFactor
+from continuum_loc.estimator.output import backbone, BodyState
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
-from continuum_loc.estimator.recovery import Recovery, place
+from continuum_loc.estimator.recovery import place, Recovery
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import Grid, column_at_rest
-from continuum_loc.estimator.window import TIME_EPSILON, Fit, Window
-from continuum_loc.measurements import Measurement, TofFrame, nanoseconds, seconds
+from continuum_loc.estimator.state import column_at_rest, Grid
+from continuum_loc.estimator.window import Fit, TIME_EPSILON, Window
+from continuum_loc.measurements import Measurement, nanoseconds, seconds, TofFrame
 from continuum_loc.robot import RobotDescription
+import numpy as np
+from threadpoolctl import ThreadpoolController
 
 PATIENCE = 1.5  # ToF periods that a cycle waits for silent sensors
 
 
 class SlidingWindowFilter:
-    """Pose, strain and velocity of the whole body, online.
+    """
+    Pose, strain and velocity of the whole body, online.
 
     robot: the description; prior_map: a `PriorMap`, or None for a robot without ToF sensors.
     counts: {"received" | "used" | "dropped" | "restarts": Counter}, the latter two by reason.
     """
 
-    def __init__(self, robot: RobotDescription, prior_map=None, settings: EstimatorSettings | None = None):
+    def __init__(
+        self, robot: RobotDescription, prior_map=None, settings: EstimatorSettings | None = None
+    ):
         self.robot = robot
         self.settings = settings or EstimatorSettings()
         self.grid = Grid(robot, self.settings.node_spacing)
         self.priors = Priors(robot, self.grid, self.settings)
         self.tof = self._make_tof(prior_map)
-        self.factors: list[Factor] = [kind(robot, self.grid, self.settings) for kind in FACTORS
-                                      if kind.name == "insertion" or getattr(self.settings, kind.name).enabled]
+        self.factors: list[Factor] = [
+            kind(robot, self.grid, self.settings)
+            for kind in FACTORS
+            if kind.name == 'insertion' or getattr(self.settings, kind.name).enabled
+        ]
         if self.tof is not None:
             self.factors.append(self.tof)
-        self.counts = {"received": Counter(), "used": Counter(), "dropped": Counter(), "restarts": Counter()}
+        self.counts = {
+            'received': Counter(),
+            'used': Counter(),
+            'dropped': Counter(),
+            'restarts': Counter(),
+        }
         self._backbone_s = np.linspace(0.0, robot.length, self.settings.backbone_points)
         self._threads = ThreadpoolController()
         self.reset()
@@ -75,11 +86,11 @@ class SlidingWindowFilter:
         index = VoxelIndex(prior_map.points, prior_map.normals, reach=self.settings.tof.gate)
         return TofFactor(self.robot, self.grid, self.settings, prior_map, index)
 
-    # ------------------------------------------------------------------ measurements in, estimates out
+    # -------------------------------------------------------------- measurements in, estimates out
 
     def process(self, measurement: Measurement) -> Estimate | None:
         """Take one measurement; an Estimate when a step fell due. Measurements that cannot be used are counted."""
-        self.counts["received"][type(measurement).__name__] += 1
+        self.counts['received'][type(measurement).__name__] += 1
         estimate = self._step() if self._cycle_over(measurement) else None
         if self._admit(measurement) and self._cycle_complete(measurement):
             estimate = self._step()
@@ -90,33 +101,39 @@ class SlidingWindowFilter:
         return self._step() if self._cycle_start is not None else None
 
     def query(self, stamp: int, s: float) -> BodyState:
-        """Mean and covariance of pose, strain and velocity at a stamp [ns] and arclength s [m].
+        """
+        Mean and covariance of pose, strain and velocity at a stamp [ns] and arclength s [m].
 
-        Inside the window, behind it as far as `history` reaches (smoothed by the knots that followed), and
-        ahead of it at constant body-frame velocity, with a covariance that grows. Raises ValueError beyond these.
+        Inside the window, behind it as far as `history` reaches (smoothed by the knots that
+        followed), and ahead of it at constant body-frame velocity, with a covariance that grows.
+        Raises ValueError beyond these.
         """
         if self.epoch is None or not self.window.intervals:
-            raise ValueError("nothing was estimated yet: process measurements first")
+            raise ValueError('nothing was estimated yet: process measurements first')
         if not 0.0 <= s <= self.robot.length:
-            raise ValueError(f"arclength {s} m is off the body; valid: 0 to {self.robot.length} m")
+            raise ValueError(f'arclength {s} m is off the body; valid: 0 to {self.robot.length} m')
         return state_at(self.window, self.history, seconds(stamp, self.epoch), s)
 
     def resolve(self, stamps: Sequence[int]) -> list[Estimate]:
-        """Linearise the whole window anew until it converges, and give its estimates at `stamps` [ns].
+        """
+        Linearise the whole window anew until it converges, and give its estimates at `stamps`
+        [ns].
 
         Raises ValueError for a stamp outside the window.
         """
         started = clock.perf_counter()
         first, last = self.window.columns[0].time, seconds(self.newest, self.epoch)
-        with self._threads.limit(limits=1, user_api="blas"):
+        with self._threads.limit(limits=1, user_api='blas'):
             self.window.mark_changed()
             iterations, converged = self.recovery.acquire()
             fit, out = self.window.fit(), []
             for stamp in stamps:
                 time = seconds(stamp, self.epoch)
                 if not first - TIME_EPSILON <= time <= last + TIME_EPSILON:
-                    raise ValueError(f"stamp {stamp} is outside the window, {self.epoch + nanoseconds(first)} to "
-                                     f"{self.newest} ns")
+                    raise ValueError(
+                        f'stamp {stamp} is outside the window, {self.epoch + nanoseconds(first)} to '
+                        f'{self.newest} ns'
+                    )
                 out.append(self._compose(time, fit, iterations, converged, started, None))
         return out
 
@@ -126,22 +143,25 @@ class SlidingWindowFilter:
             self._start(measurement.stamp)
         time = seconds(measurement.stamp, self.epoch)
         if time < self.window.columns[0].time - TIME_EPSILON:
-            self.counts["dropped"]["older than the window"] += 1
+            self.counts['dropped']['older than the window'] += 1
             return False
-        used = [self._add(factor, time, measurement) for factor in self.factors
-                if isinstance(measurement, factor.consumes)]
+        used = [
+            self._add(factor, time, measurement)
+            for factor in self.factors
+            if isinstance(measurement, factor.consumes)
+        ]
         if any(used):
-            self.counts["used"][type(measurement).__name__] += 1
+            self.counts['used'][type(measurement).__name__] += 1
             self.newest = max(self.newest, measurement.stamp)
             self._rest.note(measurement)
-            self.recovery.hear(getattr(measurement, "sensor", ""), time)
+            self.recovery.hear(getattr(measurement, 'sensor', ''), time)
         return any(used)
 
     def _add(self, factor: Factor, time: float, measurement: Measurement) -> bool:
         try:
             row = factor.row(measurement)
         except MeasurementError as error:
-            self.counts["dropped"][f"{factor.name}: {error.reason}"] += 1
+            self.counts['dropped'][f'{factor.name}: {error.reason}'] += 1
             return False
         self.window.interval_at(time).add(factor, time, row)
         return True
@@ -155,7 +175,11 @@ class SlidingWindowFilter:
         """Whether a cycle that began can wait no longer for the sensors that are missing in it."""
         if self._cycle_start is None or measurement.stamp <= self._cycle_start:
             return False
-        period = 1.0 / self.settings.output_rate if self.tof is None else PATIENCE / self.robot.tof_model.rate
+        period = (
+            1.0 / self.settings.output_rate
+            if self.tof is None
+            else PATIENCE / self.robot.tof_model.rate
+        )
         again = isinstance(measurement, TofFrame) and measurement.sensor in self._cycle
         return again or seconds(measurement.stamp, self._cycle_start) >= period - TIME_EPSILON
 
@@ -166,7 +190,11 @@ class SlidingWindowFilter:
             return False
         self._cycle.add(measurement.sensor)
         self._cycle_stamp = max(self._cycle_stamp, measurement.stamp)
-        return bool(self._last_cycle) and self._cycle >= self._last_cycle or len(self._cycle) == len(self.robot.tof)
+        return (
+            bool(self._last_cycle)
+            and self._cycle >= self._last_cycle
+            or len(self._cycle) == len(self.robot.tof)
+        )
 
     # ------------------------------------------------------------------ one step
 
@@ -177,7 +205,9 @@ class SlidingWindowFilter:
         if not self.window.intervals:
             return None
         started = clock.perf_counter()
-        with self._threads.limit(limits=1, user_api="blas"):  # small matrices: more threads only wait for one another
+        with self._threads.limit(
+            limits=1, user_api='blas'
+        ):  # small matrices: more threads only wait for one another
             iterations, converged = self._solve()
             return self._estimate(iterations, converged, started)
 
@@ -186,9 +216,11 @@ class SlidingWindowFilter:
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
             self._guess_shape()
         try:
-            iterations, converged = self.window.track() if self.recovery.acquired else self.recovery.acquire()
+            iterations, converged = (
+                self.window.track() if self.recovery.acquired else self.recovery.acquire()
+            )
         except SingularError:
-            self.counts["restarts"]["singular"] += 1
+            self.counts['restarts']['singular'] += 1
             self.window.keep_newest(1)
             iterations, converged = self.recovery.acquire()
         self._rest.finish(self.window, time)
@@ -202,12 +234,12 @@ class SlidingWindowFilter:
         strain, T_base = column.strain.copy(), column.T[0]
         for factor in self.factors:
             rows = self.window.newest_rows(factor, 1)
-            if factor.name == "strain" and rows:
+            if factor.name == 'strain' and rows:
                 s, bending, _ = rows[0]
                 order = np.argsort(s)
                 for i in range(2):
                     strain[:, 4 + i] = np.interp(self.grid.s, s[order], bending[order, i])
-            if factor.name == "insertion" and rows:
+            if factor.name == 'insertion' and rows:
                 T_base = rows[0][1]
         self.window.place(place(self.grid, column, T_base, strain))
 
@@ -221,17 +253,34 @@ class SlidingWindowFilter:
             lagged = self._compose(before, fit, iterations, converged, started, None)
         return self._compose(now, fit, iterations, converged, started, lagged)
 
-    def _compose(self, time: float, fit: Fit, iterations: int, converged: bool, started: float,
-                 lagged: Estimate | None) -> Estimate:
+    def _compose(
+        self,
+        time: float,
+        fit: Fit,
+        iterations: int,
+        converged: bool,
+        started: float,
+        lagged: Estimate | None,
+    ) -> Estimate:
         rings, body = self.grid.ring_nodes, self.window.body(time)
         covariance = self.window.motion_covariance(time, rings)
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
         return Estimate(
-            stamp=self.epoch + nanoseconds(time), T_map_ring=body.T[rings], covariance=covariance[:, :6, :6],
-            strain=body.strain[rings], velocity=body.velocity[rings], velocity_covariance=covariance[:, 6:, 6:],
+            stamp=self.epoch + nanoseconds(time),
+            T_map_ring=body.T[rings],
+            covariance=covariance[:, :6, :6],
+            strain=body.strain[rings],
+            velocity=body.velocity[rings],
+            velocity_covariance=covariance[:, 6:, 6:],
             backbone_s=self._backbone_s,
             T_map_backbone=backbone(self.grid, body.T, body.strain, self._backbone_s),
-            status=self.recovery.status, consistency=fit.squared / max(fit.count, 1), inliers=fit.shares,
-            suspects=self.recovery.suspects, iterations=iterations, converged=converged,
-            step_seconds=clock.perf_counter() - started, lagged=lagged)
+            status=self.recovery.status,
+            consistency=fit.squared / max(fit.count, 1),
+            inliers=fit.shares,
+            suspects=self.recovery.suspects,
+            iterations=iterations,
+            converged=converged,
+            step_seconds=clock.perf_counter() - started,
+            lagged=lagged,
+        )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from continuum_loc.estimator.chain import Blocks
 from continuum_loc.estimator.factors import Factor, FactorReport
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Column
+import numpy as np
 
 
 class Interval:

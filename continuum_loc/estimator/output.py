@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.state import NODE_DIM, Column, Grid
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM
+from numba import njit
+import numpy as np
 
 MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
@@ -25,10 +24,11 @@ class Body:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyState:
-    """The continuous state at one instant and arclength.
+    """
+    The continuous state at one instant and arclength.
 
-    T_map_body (4, 4), strain (6,), velocity (6,), and covariance (18, 18) of [pose, strain, velocity], pose
-    perturbations on the right.
+    T_map_body (4, 4), strain (6,), velocity (6,), and covariance (18, 18) of [pose, strain,
+    velocity], pose perturbations on the right.
     """
 
     T_map_body: np.ndarray
@@ -38,32 +38,76 @@ class BodyState:
 
 
 def body_between(a: Column, b: Column, time: float) -> Body:
-    """The body at `time` between two columns: pose and velocity by the Gaussian process's cubic Hermite, strain
-    linearly."""
+    """
+    The body at `time` between two columns: pose and velocity by the Gaussian process's cubic
+    Hermite, strain linearly.
+    """
     nodes, d = len(a.T), b.time - a.time
     T, velocity = np.empty((nodes, 4, 4)), np.empty((nodes, 6))
-    _interpolate(a.T, a.velocity, b.T, b.velocity, d, np.full(nodes, time - a.time), np.arange(nodes),
-                 np.arange(nodes), T, velocity, np.empty((0, 6, 24)), np.empty((0, 6, 24)))
+    _interpolate(
+        a.T,
+        a.velocity,
+        b.T,
+        b.velocity,
+        d,
+        np.full(nodes, time - a.time),
+        np.arange(nodes),
+        np.arange(nodes),
+        T,
+        velocity,
+        np.empty((0, 6, 24)),
+        np.empty((0, 6, 24)),
+    )
     u = (time - a.time) / d
     return Body(T, (1.0 - u) * a.strain + u * b.strain, velocity)
 
 
-def interpolated_poses(a: Column, b: Column, tau: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (m, 4, 4) of `nodes` (m,) at times tau (m,) after column a, and their Jacobians (m, 6, 24) by
-    [delta_a, v_a, delta_b, v_b] of the node."""
+def interpolated_poses(
+    a: Column, b: Column, tau: np.ndarray, nodes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Poses (m, 4, 4) of `nodes` (m,) at times tau (m,) after column a, and their Jacobians (m, 6,
+    24) by [delta_a, v_a, delta_b, v_b] of the node.
+    """
     m = len(nodes)
     T, J_pose = np.empty((m, 4, 4)), np.empty((m, 6, 24))
-    _interpolate(a.T, a.velocity, b.T, b.velocity, b.time - a.time, tau, nodes, nodes, T, np.empty((m, 6)), J_pose,
-                 np.empty((m, 6, 24)))
+    _interpolate(
+        a.T,
+        a.velocity,
+        b.T,
+        b.velocity,
+        b.time - a.time,
+        tau,
+        nodes,
+        nodes,
+        T,
+        np.empty((m, 6)),
+        J_pose,
+        np.empty((m, 6, 24)),
+    )
     return T, J_pose
 
 
-def motion_jacobians(a: Column, b: Column, time: float, nodes: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
+def motion_jacobians(
+    a: Column, b: Column, time: float, nodes: np.ndarray, dim: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Jacobians A, B (12 m, D) of [pose, velocity] of `nodes` (m,) at `time`, by the offsets of the two columns."""
     m, d, tau = len(nodes), b.time - a.time, time - a.time
     J = np.empty((m, 12, 24))
-    _interpolate(a.T, a.velocity, b.T, b.velocity, d, np.full(m, tau), nodes, nodes, np.empty((m, 4, 4)),
-                 np.empty((m, 6)), J[:, :6], J[:, 6:])
+    _interpolate(
+        a.T,
+        a.velocity,
+        b.T,
+        b.velocity,
+        d,
+        np.full(m, tau),
+        nodes,
+        nodes,
+        np.empty((m, 4, 4)),
+        np.empty((m, 6)),
+        J[:, :6],
+        J[:, 6:],
+    )
     out = np.zeros((2, m, 12, dim))
     for i, node in enumerate(nodes):
         out[:, i, :, NODE_DIM * node + MOTION] = J[i].reshape(12, 2, 12).transpose(2, 1, 0)
@@ -79,13 +123,17 @@ def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -
 
 @njit(cache=True)
 def _interpolate(T_a, v_a, T_b, v_b, d, tau, from_a, from_b, T, v, J_pose, J_rate):
-    """`gp.hermite` for many: element m goes from T_a[from_a[m]] to T_b[from_b[m]] at tau[m]; the Jacobians are
-    written where J_pose has room."""
+    """
+    `gp.hermite` for many: element m goes from T_a[from_a[m]] to T_b[from_b[m]] at tau[m]; the
+    Jacobians are written where J_pose has room.
+    """
     W, V, M = lie_kernels.workspace()
     J_work, pose, rate = np.empty((2, 6, 24)), np.empty((6, 24)), np.empty((6, 24))
     for m in range(tau.shape[0]):
         a, b = from_a[m], from_b[m]
-        gp.hermite(T_a[a], v_a[a], T_b[b], v_b[b], d, tau[m], T[m], v[m], pose, rate, W, V, M, J_work)
+        gp.hermite(
+            T_a[a], v_a[a], T_b[b], v_b[b], d, tau[m], T[m], v[m], pose, rate, W, V, M, J_work
+        )
         if m < J_pose.shape[0]:
             J_pose[m] = pose
             J_rate[m] = rate
@@ -101,8 +149,27 @@ def backbone(grid: Grid, T: np.ndarray, strain: np.ndarray, s: np.ndarray) -> np
 @njit(cache=True)
 def _backbone(T, strain, s, segments, offsets, out):
     W, V, M = lie_kernels.workspace()
-    J_pose, J_rate, J_work, rate = np.empty((6, 24)), np.empty((6, 24)), np.empty((2, 6, 24)), np.empty(6)
+    J_pose, J_rate, J_work, rate = (
+        np.empty((6, 24)),
+        np.empty((6, 24)),
+        np.empty((2, 6, 24)),
+        np.empty(6),
+    )
     for m in range(segments.shape[0]):
         n = segments[m]
-        gp.hermite(T[n], strain[n], T[n + 1], strain[n + 1], s[n + 1] - s[n], offsets[m], out[m], rate, J_pose, J_rate,
-                   W, V, M, J_work)
+        gp.hermite(
+            T[n],
+            strain[n],
+            T[n + 1],
+            strain[n + 1],
+            s[n + 1] - s[n],
+            offsets[m],
+            out[m],
+            rate,
+            J_pose,
+            J_rate,
+            W,
+            V,
+            M,
+            J_work,
+        )

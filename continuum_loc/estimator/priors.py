@@ -1,20 +1,22 @@
-"""Prior factors of one interval: the Gaussian process in time and in arclength, rest strain, base and bias.
+"""
+Prior factors of one interval: the Gaussian process in time and in arclength, rest strain, base and
+bias.
 
-An interval holds the time prior between its two columns and the factors of the *newer* column alone (its space
-prior, rest strain, base); those of the very first column are in the start message. So each factor stands once.
+An interval holds the time prior between its two columns and the factors of the *newer* column
+alone (its space prior, rest strain, base); those of the very first column are in the start
+message. So each factor stands once.
 """
 
 from __future__ import annotations
-
-import numpy as np
-from numba import njit
 
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.chain import Blocks, Message
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import NODE_DIM, POSE, STRAIN, VELOCITY, Column, Grid
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE, STRAIN, VELOCITY
 from continuum_loc.robot import RobotDescription
+from numba import njit
+import numpy as np
 
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
 BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
@@ -43,17 +45,18 @@ class Priors:
 
     def _set_base(self, robot: RobotDescription) -> None:
         base, insertion = robot.base, robot.base.insertion
-        middle = 0.0 if insertion.mode == "fixed" else float(np.mean(insertion.range))
+        middle = 0.0 if insertion.mode == 'fixed' else float(np.mean(insertion.range))
         self.T_map_base = base.T_map_base @ lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
         sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
         rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
-        if insertion.mode != "fixed":
+        if insertion.mode != 'fixed':
             sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
             rate[0] = 1.0
         self.base_information, self.base_rate_information = sigma**-2.0, rate**-2.0
 
     def start(self, column: Column, moving: bool = False) -> Message:
-        """The first column's own factors, linearised there: what is known before any measurement.
+        """
+        The first column's own factors, linearised there: what is known before any measurement.
 
         `moving` loosens the velocity, for a body found in the middle of its motion.
         """
@@ -72,17 +75,41 @@ class Priors:
     def add(self, blocks: Blocks, a: Column, b: Column) -> None:
         """Add the interval's time prior and the newer column's own factors; the cost too."""
         dt, D = b.time - a.time, self.grid.dim
-        squared = _add_time(blocks.H, blocks.g, a.T, a.velocity, a.strain, b.T, b.velocity, b.strain, dt,
-                            self.velocity, self.strain_rate)
+        squared = _add_time(
+            blocks.H,
+            blocks.g,
+            a.T,
+            a.velocity,
+            a.strain,
+            b.T,
+            b.velocity,
+            b.strain,
+            dt,
+            self.velocity,
+            self.strain_rate,
+        )
         self._add_bias(blocks, a, b, dt)
         squared += self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
         blocks.cost += 0.5 * squared
 
     def _add_column(self, H: np.ndarray, g: np.ndarray, column: Column, share: float) -> float:
-        """Space prior, rest strain and base of one column. Rest strain and base pose are one observation each, not
-        one per knot: a knot counts them by its `share` of the prior's memory."""
-        squared = _add_space(H, g, column.T, column.strain, column.velocity, self.s, self.strain, self.velocity_slope,
-                             self.rest, self.rest_information * share)
+        """
+        Space prior, rest strain and base of one column. Rest strain and base pose are one
+        observation each, not
+        one per knot: a knot counts them by its `share` of the prior's memory.
+        """
+        squared = _add_space(
+            H,
+            g,
+            column.T,
+            column.strain,
+            column.velocity,
+            self.s,
+            self.strain,
+            self.velocity_slope,
+            self.rest,
+            self.rest_information * share,
+        )
         e = lie.log(lie.inverse(self.T_map_base) @ column.T[0])
         J = lie.right_jacobian_inverse(e)
         weight = self.base_information * share
@@ -91,7 +118,9 @@ class Priors:
         at = np.arange(VELOCITY, VELOCITY + 6)
         H[at, at] += self.base_rate_information * share
         g[at] += self.base_rate_information * share * column.velocity[0]
-        return squared + weight @ e**2 + share * self.base_rate_information @ column.velocity[0] ** 2
+        return (
+            squared + weight @ e**2 + share * self.base_rate_information @ column.velocity[0] ** 2
+        )
 
     def _add_bias(self, blocks: Blocks, a: Column, b: Column, dt: float) -> None:
         D, weight = self.grid.dim, self.bias_rate / dt
@@ -107,7 +136,9 @@ class Priors:
 
 
 @njit(cache=True)
-def _add_time(H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, strain_information):
+def _add_time(
+    H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, strain_information
+):
     W, V, M = lie_kernels.workspace()
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
     size = H.shape[0] // 2
@@ -132,7 +163,9 @@ def _add_time(H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, 
 
 
 @njit(cache=True)
-def _add_space(H, g, T, strain, velocity, s, strain_information, slope_information, rest, rest_information):
+def _add_space(
+    H, g, T, strain, velocity, s, strain_information, slope_information, rest, rest_information
+):
     W, V, M = lie_kernels.workspace()
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
     weights = np.empty(6)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 from continuum_loc import lie
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.output import BodyState, body_between
-from continuum_loc.estimator.state import NODE_DIM, POSE, STRAIN, VELOCITY, Column, Grid
+from continuum_loc.estimator.output import body_between, BodyState
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE, STRAIN, VELOCITY
 from continuum_loc.estimator.window import TIME_EPSILON, Window
+import numpy as np
 
 SMOOTHED_BY = 2  # knots
 
@@ -32,8 +31,10 @@ class History:
         self._columns: deque[PastColumn] = deque()
 
     def note(self, window: Window) -> None:
-        """Keep a column once `SMOOTHED_BY` later ones have smoothed it; more of them would change it little and cost
-        much."""
+        """
+        Keep a column once `SMOOTHED_BY` later ones have smoothed it; more of them would change it
+        little and cost much.
+        """
         k = len(window.columns) - 1 - SMOOTHED_BY
         if self._duration <= 0.0 or k < 0:
             return
@@ -51,8 +52,12 @@ class History:
         for older, newer in zip(self._columns, list(self._columns)[1:], strict=False):
             if older.column.time - TIME_EPSILON <= time <= newer.column.time + TIME_EPSILON:
                 return older, newer
-        reach = f"{self._columns[0].column.time:.3f} s" if self._columns else "no time behind the window"
-        raise ValueError(f"time {time:.3f} s is not kept; the history reaches back to {reach}")
+        reach = (
+            f'{self._columns[0].column.time:.3f} s'
+            if self._columns
+            else 'no time behind the window'
+        )
+        raise ValueError(f'time {time:.3f} s is not kept; the history reaches back to {reach}')
 
 
 def state_at(window: Window, history: History, time: float, s: float) -> BodyState:
@@ -81,13 +86,17 @@ def _rows_of(window: Window, n: int) -> np.ndarray:
 
 def _behind(window: Window, history: History, time: float, n: int):
     older, newer = history.around(time)
-    # Neighbouring columns are strongly correlated; each one's own covariance at both ends, taken as fully correlated,
-    # is the larger of the two readings and so the safe one.
+    # Neighbouring columns are strongly correlated; each one's own covariance at both ends, taken
+    # as fully correlated, is the larger of the two readings and so the safe one.
     u = (time - older.column.time) / (newer.column.time - older.column.time)
     P = (1.0 - u) * older.covariance[n] + u * newer.covariance[n]
     body = body_between(older.column, newer.column, time)
-    return body.T[n:n + 2], body.strain[n:n + 2], body.velocity[n:n + 2], P + _open_bridge(window, older.column,
-                                                                                          newer.column, time)
+    return (
+        body.T[n : n + 2],
+        body.strain[n : n + 2],
+        body.velocity[n : n + 2],
+        P + _open_bridge(window, older.column, newer.column, time),
+    )
 
 
 def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n: int):
@@ -97,14 +106,22 @@ def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n
     J = np.zeros((2 * m, 4 * m))
     T, velocity = np.empty((2, 4, 4)), np.empty((2, 6))
     for i in range(2):
-        T[i], velocity[i], J_pose, J_rate = gp.interpolate(a.T[n + i], a.velocity[n + i], b.T[n + i], b.velocity[n + i],
-                                                           d, tau)
+        T[i], velocity[i], J_pose, J_rate = gp.interpolate(
+            a.T[n + i], a.velocity[n + i], b.T[n + i], b.velocity[n + i], d, tau
+        )
         for rows, part in ((POSE, J_pose), (VELOCITY, J_rate)):
             for block, column in enumerate((POSE, VELOCITY, 2 * m + POSE, 2 * m + VELOCITY)):
-                J[m * i + rows:m * i + rows + 6, m * i + column:m * i + column + 6] = part[:, 6 * block:6 * block + 6]
-        J[m * i + STRAIN:m * i + STRAIN + 6, m * i + STRAIN:m * i + STRAIN + 6] = (1.0 - u) * np.eye(6)
-        J[m * i + STRAIN:m * i + STRAIN + 6, 2 * m + m * i + STRAIN:2 * m + m * i + STRAIN + 6] = u * np.eye(6)
-    strain = (1.0 - u) * a.strain[n:n + 2] + u * b.strain[n:n + 2]
+                J[m * i + rows : m * i + rows + 6, m * i + column : m * i + column + 6] = part[
+                    :, 6 * block : 6 * block + 6
+                ]
+        J[m * i + STRAIN : m * i + STRAIN + 6, m * i + STRAIN : m * i + STRAIN + 6] = (
+            1.0 - u
+        ) * np.eye(6)
+        J[
+            m * i + STRAIN : m * i + STRAIN + 6,
+            2 * m + m * i + STRAIN : 2 * m + m * i + STRAIN + 6,
+        ] = u * np.eye(6)
+    strain = (1.0 - u) * a.strain[n : n + 2] + u * b.strain[n : n + 2]
     return T, strain, velocity, J @ P @ J.T + _open_bridge(window, a, b, time)
 
 
@@ -129,13 +146,17 @@ def _ahead(window: Window, time: float, n: int):
     P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
     later = newest.predict(dt)
     J, Q = np.zeros((2 * m, 2 * m)), np.zeros((2 * m, 2 * m))
-    growth = np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.diag(window.priors.velocity_psd))
+    growth = np.kron(
+        [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.diag(window.priors.velocity_psd)
+    )
     for i in range(2):
         twist, at = dt * newest.velocity[n + i], m * i
-        J[at:at + m, at:at + m] = np.eye(m)
-        J[at:at + 6, at:at + 6] = lie.adjoint(lie.exp(-twist))
-        J[at:at + 6, at + VELOCITY:at + VELOCITY + 6] = dt * lie.right_jacobian(twist)
-        motion = at + np.concatenate([np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)])
+        J[at : at + m, at : at + m] = np.eye(m)
+        J[at : at + 6, at : at + 6] = lie.adjoint(lie.exp(-twist))
+        J[at : at + 6, at + VELOCITY : at + VELOCITY + 6] = dt * lie.right_jacobian(twist)
+        motion = at + np.concatenate(
+            [np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)]
+        )
         Q[np.ix_(motion, motion)] += growth
         strain = at + np.arange(STRAIN, STRAIN + 6)
         Q[strain, strain] += dt / window.priors.strain_rate
@@ -144,19 +165,26 @@ def _ahead(window: Window, time: float, n: int):
 
 
 def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd) -> BodyState:
-    """From two nodes to an arclength between them: pose and strain by the same Hermite in s, velocity linearly in the
-    frames that the exact adjoint carries from the nearer node."""
+    """
+    From two nodes to an arclength between them: pose and strain by the same Hermite in s, velocity
+    linearly in the frames that the exact adjoint carries from the nearer node.
+    """
     ds, m = grid.s[n + 1] - grid.s[n], NODE_DIM
     T_s, strain_s, J_pose, J_rate = gp.interpolate(T[0], strain[0], T[1], strain[1], ds, offset)
     J = np.zeros((m, 2 * m))
     for rows, part in ((POSE, J_pose), (STRAIN, J_rate)):
         for block, column in enumerate((POSE, STRAIN, m + POSE, m + STRAIN)):
-            J[rows:rows + 6, column:column + 6] = part[:, 6 * block:6 * block + 6]
+            J[rows : rows + 6, column : column + 6] = part[:, 6 * block : 6 * block + 6]
     u = offset / ds
-    carried = [weight * lie.adjoint(lie.inverse(T_s) @ T_node) for weight, T_node in zip((1.0 - u, u), T, strict=True)]
-    J[VELOCITY:, VELOCITY:m], J[VELOCITY:, m + VELOCITY:] = carried
+    carried = [
+        weight * lie.adjoint(lie.inverse(T_s) @ T_node)
+        for weight, T_node in zip((1.0 - u, u), T, strict=True)
+    ]
+    J[VELOCITY:, VELOCITY:m], J[VELOCITY:, m + VELOCITY :] = carried
     covariance = J @ P @ J.T
     space = np.empty((2, 2))
     gp.bridge(offset, ds, space)
     covariance[:12, :12] += np.kron(space, np.diag(strain_psd))
-    return BodyState(T_s, strain_s, carried[0] @ velocity[0] + carried[1] @ velocity[1], covariance)
+    return BodyState(
+        T_s, strain_s, carried[0] @ velocity[0] + carried[1] @ velocity[1], covariance
+    )

@@ -1,34 +1,41 @@
-"""Lost and found: noticing that the body is in a wrong minimum, and finding it from the base and the map alone.
+"""
+Lost and found: noticing that the body is in a wrong minimum, and finding it from the base and the
+map alone.
 
-A wrong minimum shows in the share of ToF zones that fit the map. A low share alone is no proof (the scene may differ
-from the map), so a suspicion leads to a search of all shapes: where nothing fits better, the filter was right.
+A wrong minimum shows in the share of ToF zones that fit the map. A low share alone is no proof
+(the scene may differ from the map), so a suspicion leads to a search of all shapes: where nothing
+fits better, the filter was right.
 
-The search goes along the body, ring by ring, as a beam search: each segment bends with a curvature from a grid round
-zero, a partial body is scored by the zones of the rings it has reached, and the best, mutually different ones go on.
-It needs no initial guess and no randomness, so a replay finds the same.
+The search goes along the body, ring by ring, as a beam search: each segment bends with a curvature
+from a grid round zero, a partial body is scored by the zones of the rings it has reached, and the
+best, mutually different ones go on. It needs no initial guess and no randomness, so a replay finds
+the same.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Status
-from continuum_loc.estimator.factors.tof import TofFactor, associate, frame_information
+from continuum_loc.estimator.factors.tof import associate, frame_information, TofFactor
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Column, Grid, shape_from_strain
 from continuum_loc.estimator.window import Window
 from continuum_loc.robot import RobotDescription
+from numba import njit
+import numpy as np
 
-COARSE_SPACING = 0.04  # [m] of the thinned map that the search scores against; it has to tell decimetres apart
+COARSE_SPACING = (
+    0.04  # [m] of the thinned map that the search scores against; it has to tell decimetres apart
+)
 ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
 SEARCH_INTERVALS = 2  # the newest, whose measurements decide between bodies
 GATE_SHRINK = 0.75  # of the gate of association, at each iteration from a guess
-HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt and no single sensor
+HEALTHY_SHARE = (
+    0.85  # of the median sensor's samples fit, else the body is in doubt and no single sensor
+)
 AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
 
@@ -60,9 +67,11 @@ class Watch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """The newest frame of each ToF sensor.
+    """
+    The newest frame of each ToF sensor.
 
-    nodes (F,), zones q and rays (F, Z, 3) in the node's frame, variance (F, Z)."""
+    nodes (F,), zones q and rays (F, Z, 3) in the node's frame, variance (F, Z).
+    """
 
     nodes: np.ndarray
     q: np.ndarray
@@ -73,31 +82,45 @@ class Snapshot:
     def of(cls, rows: list[tuple]) -> Snapshot:
         """From a ToF factor's rows, in order of arrival."""
         newest = {row[0]: row for row in rows}
-        _, nodes, q, rays, variance, _ = zip(*(newest[sensor] for sensor in sorted(newest)), strict=True)
-        return cls(np.array(nodes), *(np.ascontiguousarray(np.array(x)[:, ::ZONE_STRIDE]) for x in (q, rays, variance)))
+        _, nodes, q, rays, variance, _ = zip(
+            *(newest[sensor] for sensor in sorted(newest)), strict=True
+        )
+        return cls(
+            np.array(nodes),
+            *(np.ascontiguousarray(np.array(x)[:, ::ZONE_STRIDE]) for x in (q, rays, variance)),
+        )
 
 
 class Recovery:
-    """Acquires the body at the start, watches over it, and finds it again.
+    """
+    Acquires the body at the start, watches over it, and finds it again.
 
     acquired: whether the filter tracks; suspects: sensors that do not fit while the others do.
     """
 
-    def __init__(self, robot: RobotDescription, window: Window, tof: TofFactor | None, settings: RecoverySettings):
+    def __init__(
+        self,
+        robot: RobotDescription,
+        window: Window,
+        tof: TofFactor | None,
+        settings: RecoverySettings,
+    ):
         self.acquired = False
         self.suspects: tuple[str, ...] = ()
         self._robot, self._window, self._tof, self._settings = robot, window, tof, settings
         self._watch = Watch(settings)
         self._heard: dict[str, float] = {}
         self._doubt = 0.0
-        self._shapes = None if tof is None else ShapeSearch(window.grid, tof, settings, window.priors)
+        self._shapes = (
+            None if tof is None else ShapeSearch(window.grid, tof, settings, window.priors)
+        )
 
     @property
     def status(self) -> Status:
         """What to tell of the body."""
         if self._watch.lost:
-            return "lost"
-        return "tracking" if self.acquired else "initialising"
+            return 'lost'
+        return 'tracking' if self.acquired else 'initialising'
 
     def hear(self, sensor: str, time: float) -> None:
         """Note that a sensor gave a usable sample at `time` [s]."""
@@ -109,9 +132,11 @@ class Recovery:
         return np.square(reach * np.repeat(self._settings.lost_sigma, 3))[:, :, None] * np.eye(6)
 
     def acquire(self) -> tuple[int, bool]:
-        """Solve the window from a guess: (iterations, whether it converged).
+        """
+        Solve the window from a guess: (iterations, whether it converged).
 
-        The loss is tighter than when tracking: a wrong body must not pay for few far zones by many near ones.
+        The loss is tighter than when tracking: a wrong body must not pay for few far zones by many
+        near ones.
         """
         if self._tof is None:
             return self._window.acquire(lambda iteration: True)
@@ -128,10 +153,16 @@ class Recovery:
             self.acquired = self.acquired or converged
             self._suspect(misfits)
             return
-        # A ToF sensor that does not fit may be broken, or the body wrong: only a search that finds no better body
-        # tells, so that only then it is a suspect and no longer counts.
+        # A ToF sensor that does not fit may be broken, or the body wrong: only a search that finds
+        # no better body tells, so that only then it is a suspect and no longer counts.
         tof_names = {sensor.name for sensor in self._robot.tof}
-        self._suspect([name for name in misfits if name in self.suspects or name not in tof_names or name in silent])
+        self._suspect(
+            [
+                name
+                for name in misfits
+                if name in self.suspects or name not in tof_names or name in silent
+            ]
+        )
         share = self._worst_share()
         fitting = share >= self._settings.suspect_share
         self.acquired = self.acquired or (converged and fitting)
@@ -153,9 +184,11 @@ class Recovery:
         return gate <= options.gate
 
     def _worst_share(self) -> float:
-        """Least share of fitting zones over the rings, in the newest interval that has ToF frames; sensors that are
-        themselves suspect do not count."""
-        fits = self._window.newest_fits("tof")
+        """
+        Least share of fitting zones over the rings, in the newest interval that has ToF frames;
+        sensors that are themselves suspect do not count.
+        """
+        fits = self._window.newest_fits('tof')
         by_ring: dict[str, np.ndarray] = {}
         for sensor in self._robot.tof:
             if sensor.name in fits and sensor.name not in self.suspects:
@@ -168,7 +201,9 @@ class Recovery:
         for sensors in (self._robot.tof, self._robot.imu):
             names = [sensor.name for sensor in sensors if sensor.name in shares]
             healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
-            misfits += [name for name in names if healthy and shares[name] < self._settings.sensor_share]
+            misfits += [
+                name for name in names if healthy and shares[name] < self._settings.sensor_share
+            ]
         return misfits
 
     def _silent(self, time: float) -> list[str]:
@@ -195,8 +230,11 @@ class Recovery:
                 self._tof.weights[name] = self._settings.suspect_weight if name in names else 1.0
 
     def _search(self) -> bool:
-        """Try the shapes that a search finds, take one that fits better than the present body; True when the body that
-        results is to be believed: no other one fits as well."""
+        """
+        Try the shapes that a search finds, take one that fits better than the present body; True
+        when the body that
+        results is to be believed: no other one fits as well.
+        """
         window, rings = self._window, self._window.grid.ring_nodes
         rows = window.newest_rows(self._tof, SEARCH_INTERVALS)
         if not rows:
@@ -213,14 +251,23 @@ class Recovery:
         window.set_columns(chosen[1])
         self._refine()
         self.acquired = True
-        gaps = [np.linalg.norm(columns[-1].T[rings, :3, 3] - chosen[1][-1].T[rings, :3, 3], axis=1).max()
-                for _, columns in tries]
-        return all(gap < AMBIGUOUS or cost > chosen[0] * margin for (cost, _), gap in zip(tries, gaps, strict=True))
+        gaps = [
+            np.linalg.norm(
+                columns[-1].T[rings, :3, 3] - chosen[1][-1].T[rings, :3, 3], axis=1
+            ).max()
+            for _, columns in tries
+        ]
+        return all(
+            gap < AMBIGUOUS or cost > chosen[0] * margin
+            for (cost, _), gap in zip(tries, gaps, strict=True)
+        )
 
     def _refine(self) -> tuple[float, list[Column]]:
         """Solve the window from where it is: (cost of its measurements, its columns)."""
         self.acquire()
-        return self._window.measurement_cost(), [self._window.column(k) for k in range(len(self._window.columns))]
+        return self._window.measurement_cost(), [
+            self._window.column(k) for k in range(len(self._window.columns))
+        ]
 
 
 class ShapeSearch:
@@ -232,8 +279,10 @@ class ShapeSearch:
         self._tof, self._thinned = tof, None
         count = int(round(settings.max_curvature / settings.curvature_step))
         steps = settings.curvature_step * np.arange(-count, count + 1)
-        self.curvatures = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
-        self.curvatures = self.curvatures[np.hypot(*self.curvatures.T) <= settings.max_curvature + 1e-9]
+        self.curvatures = np.stack(np.meshgrid(steps, steps, indexing='ij'), -1).reshape(-1, 2)
+        self.curvatures = self.curvatures[
+            np.hypot(*self.curvatures.T) <= settings.max_curvature + 1e-9
+        ]
         self._bending_psd = float(np.mean(1.0 / priors.strain[4:]))
 
     @property
@@ -251,7 +300,7 @@ class ShapeSearch:
         for ring in range(1, len(rings)):
             length = self.grid.s[rings[ring]] - self.grid.s[rings[ring - 1]]
             T, cost, bends = self._extend(T, cost, bends, length, rings[ring], snapshot)
-        return [self._strain_at_nodes(bend) for bend in bends[:self.settings.refined]]
+        return [self._strain_at_nodes(bend) for bend in bends[: self.settings.refined]]
 
     def _extend(self, T, cost, bends, length, node, snapshot):
         parents, grid = len(T), len(self.curvatures)
@@ -261,21 +310,33 @@ class ShapeSearch:
         frames = np.flatnonzero(snapshot.nodes == node)
         scores = self._score(ends, snapshot, frames) if len(frames) else np.zeros(len(ends))
         before = bends[:, -1] if bends.shape[1] else np.zeros((parents, 2))
-        change = np.sum((self.curvatures[None] - before[:, None]) ** 2, axis=2) / (self._bending_psd * length)
+        change = np.sum((self.curvatures[None] - before[:, None]) ** 2, axis=2) / (
+            self._bending_psd * length
+        )
         total = (cost[:, None] + 0.5 * change).ravel() + scores
         chosen = self._different(total, ends)
-        grown = np.concatenate([bends[chosen // grid], self.curvatures[chosen % grid][:, None]], axis=1)
+        grown = np.concatenate(
+            [bends[chosen // grid], self.curvatures[chosen % grid][:, None]], axis=1
+        )
         return ends[chosen], total[chosen], grown
 
     def _score(self, T: np.ndarray, snapshot: Snapshot, frames: np.ndarray) -> np.ndarray:
-        return _score(T, snapshot.q[frames], snapshot.rays[frames], snapshot.variance[frames], *self._map,
-                      self.settings.score_floor**2, self.options.acquisition_cauchy, self.settings.score_gate,
-                      self.options.min_cosine)
+        return _score(
+            T,
+            snapshot.q[frames],
+            snapshot.rays[frames],
+            snapshot.variance[frames],
+            *self._map,
+            self.settings.score_floor**2,
+            self.options.acquisition_cauchy,
+            self.settings.score_gate,
+            self.options.min_cosine,
+        )
 
     def _different(self, total: np.ndarray, T: np.ndarray) -> np.ndarray:
         """The best `beam` candidates no two of which lie within `distinct` of one another."""
         chosen: list[int] = []
-        for candidate in np.argsort(total, kind="stable"):
+        for candidate in np.argsort(total, kind='stable'):
             gaps = [np.linalg.norm(T[candidate, :3, 3] - T[c, :3, 3]) for c in chosen]
             if not gaps or min(gaps) >= self.settings.distinct:
                 chosen.append(int(candidate))
@@ -293,35 +354,77 @@ class ShapeSearch:
 
 
 def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
-    """The map's arrays for the kernels with one point for each cell of `spacing` and each octant of the normal, so that
-    both sides of a thin blade stay."""
+    """
+    The map's arrays for the kernels with one point for each cell of `spacing` and each octant of
+    the normal, so that both sides of a thin blade stay.
+    """
     from continuum_loc.mapping.voxel_index import VoxelIndex
 
     _, points, normals, planarity, variance = tof.map_arrays
     cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     octants = (normals > 0.0) @ np.array([1, 2, 4])
     keys = np.ravel_multi_index((*cells.T, octants), (*(cells.max(axis=0) + 1), 8))
-    order = np.argsort(keys, kind="stable")
+    order = np.argsort(keys, kind='stable')
     kept = order[np.flatnonzero(np.diff(keys[order], prepend=-1))]
     index = VoxelIndex(points[kept], normals[kept], reach=reach)
-    return index.arrays, *(np.ascontiguousarray(x[kept]) for x in (points, normals, planarity)), variance
+    return (
+        index.arrays,
+        *(np.ascontiguousarray(x[kept]) for x in (points, normals, planarity)),
+        variance,
+    )
 
 
 def place(grid: Grid, column: Column, T_map_base: np.ndarray, strain: np.ndarray) -> Column:
     """The column put motionless into another shape; its biases stay."""
-    return Column(column.time, shape_from_strain(T_map_base, grid.s, strain), strain.copy(), np.zeros_like(strain),
-                  column.bias.copy())
+    return Column(
+        column.time,
+        shape_from_strain(T_map_base, grid.s, strain),
+        strain.copy(),
+        np.zeros_like(strain),
+        column.bias.copy(),
+    )
 
 
 @njit(cache=True)
-def _score(T, q, rays, variance, arrays, cloud, normals, planarity, map_variance, floor2, cauchy, gate, min_cosine):
+def _score(
+    T,
+    q,
+    rays,
+    variance,
+    arrays,
+    cloud,
+    normals,
+    planarity,
+    map_variance,
+    floor2,
+    cauchy,
+    gate,
+    min_cosine,
+):
     """Robust cost (M,) of the frames at each pose T (M, 4, 4)."""
     H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.empty(q.shape[1], np.int64)
     out = np.zeros(T.shape[0])
     for m in range(T.shape[0]):
         for f in range(q.shape[0]):
             associate(T[m], q[f], rays[f], variance[f], arrays, normals, gate, min_cosine, hits)
-            cost, _, _ = frame_information(T[m], q[f], rays[f], variance[f], hits, 1.0, cloud, normals, planarity,
-                                           map_variance, floor2, 0.0, cauchy, gate, H, g, fit)
+            cost, _, _ = frame_information(
+                T[m],
+                q[f],
+                rays[f],
+                variance[f],
+                hits,
+                1.0,
+                cloud,
+                normals,
+                planarity,
+                map_variance,
+                floor2,
+                0.0,
+                cauchy,
+                gate,
+                H,
+                g,
+                fit,
+            )
             out[m] += cost
     return out

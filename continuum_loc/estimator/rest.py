@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from continuum_loc import lie
 from continuum_loc.estimator.settings import GyroSettings
 from continuum_loc.estimator.state import Grid
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import ImuSample, Measurement
 from continuum_loc.robot import RobotDescription
+import numpy as np
 
 REST_TURN = 0.005  # [rad] a body that turned farther during the initial rest was not at rest
 REST_SIGMA = 0.002  # [rad/s] how well rest is rest
@@ -36,8 +35,12 @@ class InitialRest:
         if window.pinned:
             return
         weight, mean = np.zeros(3 * self._grid.biases), np.zeros(3 * self._grid.biases)
-        turned = np.linalg.norm(lie.so3_log(np.swapaxes(window.column(0).T[:, :3, :3], 1, 2)
-                                            @ window.column(-1).T[:, :3, :3]), axis=1)
+        turned = np.linalg.norm(
+            lie.so3_log(
+                np.swapaxes(window.column(0).T[:, :3, :3], 1, 2) @ window.column(-1).T[:, :3, :3]
+            ),
+            axis=1,
+        )
         for number, imu in enumerate(self._robot.imu):
             samples = np.array(rates.get(imu.name, []))
             node = self._grid.node_at(self._robot.sensor_arclength(imu.name))
@@ -49,4 +52,7 @@ class InitialRest:
         window.observe_bias(weight, mean)
 
     def _steady(self, samples: np.ndarray) -> bool:
-        return len(samples) >= LEAST_SAMPLES and float(np.max(np.std(samples, axis=0))) <= self._settings.rest_rate
+        return (
+            len(samples) >= LEAST_SAMPLES
+            and float(np.max(np.std(samples, axis=0))) <= self._settings.rest_rate
+        )

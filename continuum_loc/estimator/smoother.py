@@ -13,15 +13,24 @@ from continuum_loc.robot import RobotDescription
 ENDLESS = 1e9  # [s] a window that never marginalises
 
 
-def smooth(robot: RobotDescription, prior_map, settings: EstimatorSettings, measurements: Iterable[Measurement],
-           stamps: Sequence[int]) -> list[Estimate]:
-    """Estimates at `stamps` [ns] from all measurements at once; memory grows with the recording.
-
-    The filter with an endless window gives the start; then everything is linearised anew until it converges.
-    Raises ValueError for a stamp outside the recording.
+def smooth(
+    robot: RobotDescription,
+    prior_map,
+    settings: EstimatorSettings,
+    measurements: Iterable[Measurement],
+    stamps: Sequence[int],
+) -> list[Estimate]:
     """
-    filter_ = SlidingWindowFilter(robot, prior_map, settings.model_copy(update={"window": ENDLESS, "lag": 0.0,
-                                                                                "history": 0.0}))
+    Estimates at `stamps` [ns] from all measurements at once; memory grows with the recording.
+
+    The filter with an endless window gives the start; then everything is linearised anew until it
+    converges. Raises ValueError for a stamp outside the recording.
+    """
+    filter_ = SlidingWindowFilter(
+        robot,
+        prior_map,
+        settings.model_copy(update={'window': ENDLESS, 'lag': 0.0, 'history': 0.0}),
+    )
     for measurement in measurements:
         filter_.process(measurement)
     filter_.flush()

@@ -1,28 +1,31 @@
-"""The state on its grid of times and arclengths.
+"""
+The state on its grid of times and arclengths.
 
-A *column* is the whole body at one knot time: N nodes of {T_map_body, strain, velocity} and a gyro bias for
-each IMU. Its tangent vector has 18 N + 3 I entries: node n at 18 n as [pose 6, strain 6, velocity 6], then
-the biases. Pose perturbations act on the right.
+A *column* is the whole body at one knot time: N nodes of {T_map_body, strain, velocity} and a gyro
+bias for each IMU. Its tangent vector has 18 N + 3 I entries: node n at 18 n as [pose 6, strain 6,
+velocity 6], then the biases. Pose perturbations act on the right.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie, lie_kernels
 from continuum_loc.robot import RobotDescription
+from numba import njit
+import numpy as np
 
 NODE_DIM = 18
 POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
 
 
 class Grid:
-    """Where the nodes are: at the base, at every ring and the tip, and in between no farther than `spacing`.
+    """
+    Where the nodes are: at the base, at every ring and the tip, and in between no farther than
+    `spacing`.
 
-    s: (N,) arclengths [m]; ring_nodes: (R + 1,) nodes of the base and of the rings; biases: number of IMUs;
+    s: (N,) arclengths [m]; ring_nodes: (R + 1,) nodes of the base and of the rings; biases: number
+    of IMUs;
     dim: length of a column's tangent vector.
     """
 
@@ -30,8 +33,10 @@ class Grid:
         anchors = np.unique(np.concatenate([[0.0], robot.ring_arclengths, [robot.length]]))
         if anchors[-1] - anchors[-2] < 1e-6:
             anchors = np.delete(anchors, -2 if len(anchors) > 2 else -1)
-        pieces = [np.linspace(a, b, int(np.ceil((b - a) / spacing - 1e-9)), endpoint=False)
-                  for a, b in zip(anchors[:-1], anchors[1:], strict=True)]
+        pieces = [
+            np.linspace(a, b, int(np.ceil((b - a) / spacing - 1e-9)), endpoint=False)
+            for a, b in zip(anchors[:-1], anchors[1:], strict=True)
+        ]
         self.s = np.concatenate([*pieces, anchors[-1:]])
         self.ring_nodes = np.array([self.node_at(s) for s in (0.0, *robot.ring_arclengths)])
         self.nodes = len(self.s)
@@ -45,7 +50,7 @@ class Grid:
 
     def segments(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The nodes (m,) below arclengths s (m,) and the distances (m,) from them [m]; s is clipped to the body."""
-        n = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, self.nodes - 2)
+        n = np.clip(np.searchsorted(self.s, s, side='right') - 1, 0, self.nodes - 2)
         return n, np.clip(s, self.s[0], self.s[-1]) - self.s[n]
 
     def segment(self, s: float) -> tuple[int, float]:
@@ -65,7 +70,9 @@ class Column:
     bias: np.ndarray
 
     def copy(self) -> Column:
-        return Column(self.time, self.T.copy(), self.strain.copy(), self.velocity.copy(), self.bias.copy())
+        return Column(
+            self.time, self.T.copy(), self.strain.copy(), self.velocity.copy(), self.bias.copy()
+        )
 
     def retract(self, delta: np.ndarray) -> Column:
         """The column moved by a tangent vector (18 N + 3 I,)."""
@@ -75,14 +82,25 @@ class Column:
 
     def minus(self, other: Column) -> np.ndarray:
         """Tangent vector from `other` to this column: other.retract(self.minus(other)) is self."""
-        nodes = np.concatenate([lie.log(lie.inverse(other.T) @ self.T), self.strain - other.strain,
-                                self.velocity - other.velocity], axis=1)
+        nodes = np.concatenate(
+            [
+                lie.log(lie.inverse(other.T) @ self.T),
+                self.strain - other.strain,
+                self.velocity - other.velocity,
+            ],
+            axis=1,
+        )
         return np.concatenate([nodes.ravel(), (self.bias - other.bias).ravel()])
 
     def predict(self, dt: float) -> Column:
         """The column dt later at constant body-frame velocity: the prior's mean."""
-        return Column(self.time + dt, self.T @ lie.exp(dt * self.velocity), self.strain.copy(), self.velocity.copy(),
-                      self.bias.copy())
+        return Column(
+            self.time + dt,
+            self.T @ lie.exp(dt * self.velocity),
+            self.strain.copy(),
+            self.velocity.copy(),
+            self.bias.copy(),
+        )
 
 
 @njit(cache=True)
@@ -90,7 +108,7 @@ def _retract(T, strain, velocity, bias, delta):
     step, moved = np.empty((4, 4)), np.empty((4, 4))
     nodes = T.shape[0]
     for n in range(nodes):
-        lie_kernels.exp(delta[18 * n:18 * n + 6], step)
+        lie_kernels.exp(delta[18 * n : 18 * n + 6], step)
         lie_kernels.compose(T[n], step, moved)
         T[n] = moved
         for i in range(6):
@@ -113,5 +131,10 @@ def shape_from_strain(T_map_base: np.ndarray, s: np.ndarray, strain: np.ndarray)
 
 def column_at_rest(grid: Grid, T_map_base: np.ndarray, strain: np.ndarray, time: float) -> Column:
     """A motionless column with the given strain (N, 6)."""
-    return Column(time, shape_from_strain(T_map_base, grid.s, strain), strain.copy(), np.zeros_like(strain),
-                  np.zeros((grid.biases, 3)))
+    return Column(
+        time,
+        shape_from_strain(T_map_base, grid.s, strain),
+        strain.copy(),
+        np.zeros_like(strain),
+        np.zeros((grid.biases, 3)),
+    )

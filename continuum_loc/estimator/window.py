@@ -1,9 +1,12 @@
-"""The window: a chain of columns (the body at knot times) coupled by intervals (priors and measurements between two).
+"""
+The window: a chain of columns (the body at knot times) coupled by intervals (priors and
+measurements between two).
 
-Each column has a linearisation point and an offset from it; a solve gives all offsets at once. A column that moved far
-is linearised anew, together with the intervals that touch it; the others keep their normal equations, and the chain
-keeps its elimination up to the first that changed. The oldest column is marginalised as the window moves on; the point
-at which that happened is pinned (first-estimate Jacobians).
+Each column has a linearisation point and an offset from it; a solve gives all offsets at once. A
+column that moved far is linearised anew, together with the intervals that touch it; the others
+keep their normal equations, and the chain keeps its elimination up to the first that changed. The
+oldest column is marginalised as the window moves on; the point at which that happened is pinned
+(first-estimate Jacobians).
 """
 
 from __future__ import annotations
@@ -11,25 +14,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from continuum_loc.estimator.chain import Chain, Message, SingularError
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.output import Body, body_between, motion_bridge, motion_jacobians
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import NODE_DIM, Column, Grid
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM
+import numpy as np
 
 TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
 DAMPING_LIMIT = 1e4
-COST_SLACK = 1e-3  # relative: associations change between iterations, so costs compare only so well
+COST_SLACK = (
+    1e-3  # relative: associations change between iterations, so costs compare only so well
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """How the window's measurements fit: squared normalised residuals, their number, and the share of fitting samples
-    by sensor."""
+    """
+    How the window's measurements fit: squared normalised residuals, their number, and the share of
+    fitting samples by sensor.
+    """
 
     squared: float
     count: int
@@ -49,7 +55,7 @@ class Window:
         self._moving = False
         self._bias: tuple[np.ndarray, np.ndarray] | None = None
 
-    # ------------------------------------------------------------------ the stretch of time that it covers
+    # ---------------------------------------------------------- the stretch of time that it covers
 
     def start(self, column: Column) -> None:
         """Begin with one column at rest."""
@@ -142,9 +148,11 @@ class Window:
         return limit, False
 
     def acquire(self, narrow: Callable[[int], bool]) -> tuple[int, bool]:
-        """Iterate from a guess, damped whenever the cost rises: (iterations, whether it converged).
+        """
+        Iterate from a guess, damped whenever the cost rises: (iterations, whether it converged).
 
-        narrow(iteration) tightens the association before each iteration; True once it is as tight as when tracking.
+        narrow(iteration) tightens the association before each iteration; True once it is as tight
+        as when tracking.
         """
         damping, limit = 0.0, self.settings.solver.acquisition_iterations
         for iteration in range(1, limit + 1):
@@ -215,15 +223,17 @@ class Window:
 
     def _pose_moves(self, offsets: list[np.ndarray] | np.ndarray) -> np.ndarray:
         """(K,) largest pose component [m, rad] of each column's offset."""
-        nodes = np.asarray(offsets)[:, :self.grid.bias_offset].reshape(len(offsets), -1, NODE_DIM)
+        nodes = np.asarray(offsets)[:, : self.grid.bias_offset].reshape(len(offsets), -1, NODE_DIM)
         return np.abs(nodes[:, :, :6]).max(axis=(1, 2))
 
     def _cost(self) -> float:
         """Robust cost where linearised, and by the quadratic model at the offsets."""
         start, x = self.chain.messages[0], self.offsets[0]
         total = float(x @ (start.gradient + 0.5 * (start.information @ x)))
-        return total + sum(interval.modelled_cost(self.offsets[k], self.offsets[k + 1])
-                           for k, interval in enumerate(self.intervals))
+        return total + sum(
+            interval.modelled_cost(self.offsets[k], self.offsets[k + 1])
+            for k, interval in enumerate(self.intervals)
+        )
 
     # ------------------------------------------------------------------ what it says
 
@@ -237,11 +247,17 @@ class Window:
                 count += report.count
                 for sensor, fit in report.fits.items():
                     samples[sensor] = samples.get(sensor, 0.0) + fit
-        return Fit(squared, count, {name: float(fit[1] / fit[0]) for name, fit in samples.items() if fit[0] > 0})
+        return Fit(
+            squared,
+            count,
+            {name: float(fit[1] / fit[0]) for name, fit in samples.items() if fit[0] > 0},
+        )
 
     def measurement_cost(self) -> float:
         """Robust cost of the measurements alone, without the priors."""
-        return sum(report.cost for interval in self.intervals for report in interval.reports.values())
+        return sum(
+            report.cost for interval in self.intervals for report in interval.reports.values()
+        )
 
     def newest_fits(self, factor_name: str) -> dict[str, np.ndarray]:
         """[usable, fitting] samples by sensor, in the newest interval that has any of this factor."""

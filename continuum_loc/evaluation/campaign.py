@@ -1,22 +1,24 @@
-"""Many trials: several processes, one failure takes no other along, and an interrupted campaign continues.
+"""
+Many trials: several processes, one failure takes no other along, and an interrupted campaign
+continues.
 
-    OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay the same bag
-    OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong
+OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay the same bag
+OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed, ProcessPoolExecutor
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass
 import hashlib
 import json
 import os
+from pathlib import Path
 import shutil
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextvars import ContextVar
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from continuum_loc.evaluation.study import plain
 from continuum_loc.evaluation.trials import Trial
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
 
 # Address of a Dask scheduler that runs the work instead of processes of our own; none by default.
-SCHEDULER: ContextVar[str] = ContextVar("scheduler", default="")
+SCHEDULER: ContextVar[str] = ContextVar('scheduler', default='')
 
 CONNECT_LIMIT = 10  # s
 
@@ -42,30 +44,41 @@ class Outcome:
 
     trial: Any  # a Trial, or a recorded one: what it must have is a `name`
     summary: dict[str, Any] | None
-    error: str = ""
+    error: str = ''
 
 
-def run_campaign(trials: Sequence[Trial], out: Path, jobs: int = 1, settings: EstimatorSettings | None = None,
-                 progress: Progress | None = None) -> list[Outcome]:
-    """Run the trials that have not been run yet, and return all outcomes in the order of `trials`.
+def run_campaign(
+    trials: Sequence[Trial],
+    out: Path,
+    jobs: int = 1,
+    settings: EstimatorSettings | None = None,
+    progress: Progress | None = None,
+) -> list[Outcome]:
+    """
+    Run the trials that have not been run yet, and return all outcomes in the order of `trials`.
 
-    The number of jobs changes nothing but the time: each trial is seeded and runs in one process by itself.
+    The number of jobs changes nothing but the time: each trial is seeded and runs in one process
+    by itself.
     """
     progress = progress or show_progress
     failed = record_bags(trials, out, jobs, progress)
     todo = [(out, trial, settings) for trial in trials if trial.recording not in failed]
     found = {}
-    for outcome in progress(parallel(_estimate, todo, jobs), len(todo), "estimating"):
+    for outcome in progress(parallel(_estimate, todo, jobs), len(todo), 'estimating'):
         found[outcome.trial] = outcome
     return [found.get(trial) or Outcome(trial, None, failed[trial.recording]) for trial in trials]
 
 
-def record_bags(trials: Sequence[Trial], out: Path, jobs: int = 1, progress: Progress | None = None) -> dict[str, str]:
+def record_bags(
+    trials: Sequence[Trial], out: Path, jobs: int = 1, progress: Progress | None = None
+) -> dict[str, str]:
     """Simulate the recordings of `trials` that `out` does not hold yet. Returns {recording: error} of what failed."""
     progress = progress or show_progress
     bags = {trial.recording: trial for trial in trials if not bag_of(out, trial).is_dir()}
     failed = {}
-    for done in progress(parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), "simulating"):
+    for done in progress(
+        parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), 'simulating'
+    ):
         failed |= done
     return failed
 
@@ -81,7 +94,9 @@ def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]
     import multiprocessing
 
     # Fresh interpreters: forked ones would share the state of numeric libraries' threads.
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(
+        jobs, multiprocessing.get_context('spawn'), initializer=_one_thread
+    ) as pool:
         for future in as_completed([pool.submit(work, *each) for each in arguments]):
             yield future.result()
 
@@ -89,30 +104,33 @@ def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]
 def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterator[Any]:
     """The same on the workers of a Dask cluster, which must see the same files under the same names."""
     try:
-        from distributed import Client
         from distributed import as_completed as as_distributed
+        from distributed import Client
     except ImportError:
-        raise CampaignError("a scheduler needs Dask: pip install distributed") from None
+        raise CampaignError('a scheduler needs Dask: pip install distributed') from None
     try:
         client = Client(address, timeout=CONNECT_LIMIT)
     except (OSError, TimeoutError, ValueError) as error:
-        raise CampaignError(f"no Dask scheduler at {address} ({error or type(error).__name__})") from None
+        raise CampaignError(
+            f'no Dask scheduler at {address} ({error or type(error).__name__})'
+        ) from None
     with client:
         client.run(_one_thread)
-        # The work is seeded, so a cached result would be right; but files are part of it, so nothing is reused.
+        # The work is seeded, so a cached result would be right; but files are part of it, so
+        # nothing is reused.
         futures = [client.submit(work, *each, pure=False) for each in arguments]
         for future in as_distributed(futures):
             yield future.result()
 
 
 def _one_thread() -> None:
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
+    for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
+        os.environ[name] = '1'
 
 
 def bag_of(out: Path, trial: Trial) -> Path:
     """Where the campaign in `out` keeps the bag of a trial."""
-    return out / "bags" / trial.recording
+    return out / 'bags' / trial.recording
 
 
 def _record(out: Path, trial: Trial) -> dict[str, str]:
@@ -120,47 +138,66 @@ def _record(out: Path, trial: Trial) -> dict[str, str]:
     from continuum_loc.evaluation.trials import simulate, write_bag
 
     bag = bag_of(out, trial)
-    partial = bag.with_name(f".{bag.name}.{os.getpid()}")
+    partial = bag.with_name(f'.{bag.name}.{os.getpid()}')
     try:
         bag.parent.mkdir(parents=True, exist_ok=True)
         write_bag(partial, simulate(trial))
         partial.rename(bag)  # a bag under its name is a whole one
     except Exception as error:
         shutil.rmtree(partial, ignore_errors=True)
-        return {trial.recording: f"simulating: {type(error).__name__}: {error}"}
+        return {trial.recording: f'simulating: {type(error).__name__}: {error}'}
     return {}
 
 
 def _estimate(out: Path, trial: Trial, settings: EstimatorSettings | None) -> Outcome:
     """Replay a trial's bag, or take the result of an earlier run with the same configuration."""
-    folder = out / "trials" / trial.name
+    folder = out / 'trials' / trial.name
     try:
         return _run(folder, bag_of(out, trial), trial, settings)
     except Exception as error:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "error.txt").write_text(traceback.format_exc())
-        return Outcome(trial, None, f"{type(error).__name__}: {error}")
+        (folder / 'error.txt').write_text(traceback.format_exc())
+        return Outcome(trial, None, f'{type(error).__name__}: {error}')
 
 
 def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | None) -> Outcome:
     from continuum_loc.evaluation.replay import replay
     from continuum_loc.evaluation.runs import save_run
-    from continuum_loc.evaluation.trials import configuration, make_filter, scene_map, trial_settings
+    from continuum_loc.evaluation.trials import (
+        configuration,
+        make_filter,
+        scene_map,
+        trial_settings,
+    )
     from continuum_loc.robot import load_robot
 
-    estimator = make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene),
-                            settings or trial_settings(trial))
+    estimator = make_filter(
+        load_robot(trial.robot),
+        scene_map(trial.map_scene or trial.scene),
+        settings or trial_settings(trial),
+    )
     resolved = configuration(trial, estimator=estimator.settings)
-    key = hashlib.sha256(json.dumps([plain(resolved), asdict(trial)], sort_keys=True).encode()).hexdigest()
-    summary_file = folder / "summary.json"
+    key = hashlib.sha256(
+        json.dumps([plain(resolved), asdict(trial)], sort_keys=True).encode()
+    ).hexdigest()
+    summary_file = folder / 'summary.json'
     if summary_file.is_file():
         summary = json.loads(summary_file.read_text())
-        if summary.get("configuration_digest") == key:
+        if summary.get('configuration_digest') == key:
             return Outcome(trial, summary)
-    (folder / "error.txt").unlink(missing_ok=True)
+    (folder / 'error.txt').unlink(missing_ok=True)
     result = replay(bag, estimator)
-    return Outcome(trial, save_run(folder, result, kind="trial", seed=trial.seed, configuration=resolved,
-                                   extra={"configuration_digest": key}))
+    return Outcome(
+        trial,
+        save_run(
+            folder,
+            result,
+            kind='trial',
+            seed=trial.seed,
+            configuration=resolved,
+            extra={'configuration_digest': key},
+        ),
+    )
 
 
 def show_progress(results: Iterator[Any], total: int, label: str) -> Iterator[Any]:

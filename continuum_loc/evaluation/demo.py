@@ -7,20 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from continuum_loc.estimator.settings import settings_of
 from continuum_loc.evaluation.metrics import errors, summarise
-from continuum_loc.evaluation.replay import ReplayResult, place_points, samples_of
+from continuum_loc.evaluation.replay import place_points, ReplayResult, samples_of
 from continuum_loc.evaluation.replay import replay as run_replay
 from continuum_loc.evaluation.report import context_of, write_report
 from continuum_loc.evaluation.runs import distribution, load_run, new_run, save_run
-from continuum_loc.evaluation.study import Claim, at_least, at_most
+from continuum_loc.evaluation.study import at_least, at_most, Claim
 from continuum_loc.evaluation.tracks import BASE, Track
-from continuum_loc.evaluation.trials import Trial, configuration, make_filter, scene_map_file
+from continuum_loc.evaluation.trials import configuration, make_filter, scene_map_file, Trial
 from continuum_loc.mapping.prior_map import load_map
 from continuum_loc.measurements import TofFrame
-from continuum_loc.robot import RobotDescription, load_robot
+from continuum_loc.robot import load_robot, RobotDescription
+import numpy as np
 
 Tell = Callable[[str], None]
 
@@ -42,27 +41,49 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
 
     robot = load_robot(trial.robot)
     settings = settings_of(robot.name)
-    tell("building the scene and its prior map (kept for the next time)")
+    tell('building the scene and its prior map (kept for the next time)')
     map_file = scene_map_file(trial.scene)
-    folder = new_run("demo", root)
-    live = run_live(folder / "live", robot=trial.robot, scene=trial.scene, trajectory=trial.trajectory,
-                    prior_map=map_file, duration=trial.duration or 20.0, seed=trial.seed, profile=trial.profile,
-                    tof_fidelity=trial.fidelity, progress=lambda stage, share: tell(f"{stage} {100 * share:.0f} %"))
-    bag = (folder / "live" / "bag").rename(folder / "bag")
+    folder = new_run('demo', root)
+    live = run_live(
+        folder / 'live',
+        robot=trial.robot,
+        scene=trial.scene,
+        trajectory=trial.trajectory,
+        prior_map=map_file,
+        duration=trial.duration or 20.0,
+        seed=trial.seed,
+        profile=trial.profile,
+        tof_fidelity=trial.fidelity,
+        progress=lambda stage, share: tell(f'{stage} {100 * share:.0f} %'),
+    )
+    bag = (folder / 'live' / 'bag').rename(folder / 'bag')
     prior = load_map(map_file)
     replays = []
     for number in (1, 2):
-        tell(f"replaying the bag without ROS, run {number} of 2")
+        tell(f'replaying the bag without ROS, run {number} of 2')
         replays.append(run_replay(bag, make_filter(robot, prior, settings)))
     shown = with_live_poses(replays[0], recorded_track(bag, robot), bag, robot)
-    shown = replace(shown, latency_seconds=np.array(live.latencies_s), counts={**live.counts, "lost": live.lost})
+    shown = replace(
+        shown,
+        latency_seconds=np.array(live.latencies_s),
+        counts={**live.counts, 'lost': live.lost},
+    )
     identical = replays[0].digest == replays[1].digest
     claims = demo_claims(shown, live.lost, identical)
-    summary = save_run(folder, shown, kind="demo", seed=trial.seed,
-                       configuration=configuration(trial, estimator=settings, map={"file": map_file}, bag=bag),
-                       extra={"claims": claims, "live_step_ms": live.step_ms, "lost_messages": live.lost,
-                              "replay": replay_summary(shown, replays[0], identical)})
-    tell("writing the report")
+    summary = save_run(
+        folder,
+        shown,
+        kind='demo',
+        seed=trial.seed,
+        configuration=configuration(trial, estimator=settings, map={'file': map_file}, bag=bag),
+        extra={
+            'claims': claims,
+            'live_step_ms': live.step_ms,
+            'lost_messages': live.lost,
+            'replay': replay_summary(shown, replays[0], identical),
+        },
+    )
+    tell('writing the report')
     run = load_run(folder)
     write_report(run, context_of(run))
     return DemoOutcome(folder, bag, summary, claims, identical)
@@ -73,32 +94,50 @@ def recorded_track(bag: Path, robot: RobotDescription) -> Track:
     from msg_tools.bag import read_bag
 
     poses, backbones = {}, {}
-    for topic, item in read_bag(bag, topics=("poses", "backbone")):
-        if topic == "poses":
+    for topic, item in read_bag(bag, topics=('poses', 'backbone')):
+        if topic == 'poses':
             poses[item.stamp] = item.T_map_body
         else:
             backbones[item.stamp] = item.T_map_backbone[:, :3, 3]
     stamps = sorted(poses.keys() & backbones.keys())
     if not stamps:
         return Track.empty((BASE, *robot.ring_names))
-    return Track(np.array(stamps, np.int64), (BASE, *robot.ring_names), np.stack([poses[stamp] for stamp in stamps]),
-                 backbone=np.stack([backbones[stamp] for stamp in stamps]))
+    return Track(
+        np.array(stamps, np.int64),
+        (BASE, *robot.ring_names),
+        np.stack([poses[stamp] for stamp in stamps]),
+        backbone=np.stack([backbones[stamp] for stamp in stamps]),
+    )
 
 
-def with_live_poses(replayed: ReplayResult, live: Track, bag: Path, robot: RobotDescription) -> ReplayResult:
-    """`replayed` with the poses that were published live instead of its own.
+def with_live_poses(
+    replayed: ReplayResult, live: Track, bag: Path, robot: RobotDescription
+) -> ReplayResult:
+    """
+    `replayed` with the poses that were published live instead of its own.
 
-    The topic `poses` carries no covariance: covariance, status and consistency are the replay's at the same stamps,
-    and instants that the replay has not are left out (their number is in the summary).
+    The topic `poses` carries no covariance: covariance, status and consistency are the replay's at
+    the same stamps, and instants that the replay has not are left out (their number is in the
+    summary).
     """
     common, mine, theirs = np.intersect1d(live.stamps, replayed.track.stamps, return_indices=True)
     if len(common) == 0:
         return replayed
-    track = Track(common, live.names, live.T_map_ring[mine], replayed.track.covariance[theirs],
-                  replayed.track.status[theirs], live.backbone[mine])
+    track = Track(
+        common,
+        live.names,
+        live.T_map_ring[mine],
+        replayed.track.covariance[theirs],
+        replayed.track.status[theirs],
+        live.backbone[mine],
+    )
     frames = (item for item in samples_of(bag) if isinstance(item, TofFrame))
-    return replace(replayed, track=track, consistency=replayed.consistency[theirs],
-                   cloud=place_points(_spread(frames), track, robot))
+    return replace(
+        replayed,
+        track=track,
+        consistency=replayed.consistency[theirs],
+        cloud=place_points(_spread(frames), track, robot),
+    )
 
 
 def _spread(frames: Any) -> list[TofFrame]:
@@ -115,21 +154,30 @@ def _spread(frames: Any) -> list[TofFrame]:
 def replay_summary(live: ReplayResult, replayed: ReplayResult, identical: bool) -> dict[str, Any]:
     """Errors of the replay, and how far the live poses are from it."""
     _, mine, theirs = np.intersect1d(live.track.stamps, replayed.track.stamps, return_indices=True)
-    apart = np.linalg.norm(live.track.T_map_ring[mine, :, :3, 3] - replayed.track.T_map_ring[theirs, :, :3, 3], axis=-1)
-    return {"identical": identical, "estimates": len(replayed.track), "estimates_live": len(live.track),
-            "live_minus_replay_m": distribution(apart.ravel()),
-            **summarise(errors(replayed.track, replayed.truth))}
+    apart = np.linalg.norm(
+        live.track.T_map_ring[mine, :, :3, 3] - replayed.track.T_map_ring[theirs, :, :3, 3],
+        axis=-1,
+    )
+    return {
+        'identical': identical,
+        'estimates': len(replayed.track),
+        'estimates_live': len(live.track),
+        'live_minus_replay_m': distribution(apart.ravel()),
+        **summarise(errors(replayed.track, replayed.truth)),
+    }
 
 
 def demo_claims(result: ReplayResult, lost: dict[str, int], identical: bool) -> list[Claim]:
     """The bounds that a live run has to keep."""
     found = summarise(errors(result.track, result.truth))
     latency = distribution(1e3 * result.latency_seconds)
-    dropped = sum(sum(result.counts[node]["dropped"].values()) for node in ("estimator", "filter"))
-    return [at_most("translation MAE", 100 * found["translation_mae_m"], "cm", 0.4),
-            at_most("rotation MAE", found["rotation_mae_deg"], "deg", 0.5),
-            at_most("live latency p95", latency["p95"], "ms", 66.0),
-            at_most("messages lost on the way", sum(lost.values()), "", 0),
-            at_most("messages dropped by the estimator", dropped, "", 0),
-            at_least("replay real-time factor", result.real_time_factor, "", 2.0),
-            at_least("replays identical", float(identical), "", 1.0)]
+    dropped = sum(sum(result.counts[node]['dropped'].values()) for node in ('estimator', 'filter'))
+    return [
+        at_most('translation MAE', 100 * found['translation_mae_m'], 'cm', 0.4),
+        at_most('rotation MAE', found['rotation_mae_deg'], 'deg', 0.5),
+        at_most('live latency p95', latency['p95'], 'ms', 66.0),
+        at_most('messages lost on the way', sum(lost.values()), '', 0),
+        at_most('messages dropped by the estimator', dropped, '', 0),
+        at_least('replay real-time factor', result.real_time_factor, '', 2.0),
+        at_least('replays identical', float(identical), '', 1.0),
+    ]

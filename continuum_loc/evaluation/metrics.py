@@ -1,19 +1,20 @@
-"""Errors of an estimated track against truth: size (MAE, RMSE) and honesty (NEES, coverage).
+"""
+Errors of an estimated track against truth: size (MAE, RMSE) and honesty (NEES, coverage).
 
-Translation error is |p_est - p_true|, rotation error the angle of R_est^T R_true. The pose error that consistency
-is judged by is the right perturbation xi = Log(T_est^-1 T_true), 6 degrees of freedom per pose, whose covariance is
-the estimate's; NEES = xi^T P^-1 xi, and a pose is covered when NEES <= chi2(0.95, 6).
+Translation error is |p_est - p_true|, rotation error the angle of R_est^T R_true. The pose error
+that consistency is judged by is the right perturbation xi = Log(T_est^-1 T_true), 6 degrees of
+freedom per pose, whose covariance is the estimate's; NEES = xi^T P^-1 xi, and a pose is covered
+when NEES <= chi2(0.95, 6).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from continuum_loc import lie
+from continuum_loc.evaluation.tracks import associate, Track
 import numpy as np
 from scipy.stats import chi2
-
-from continuum_loc import lie
-from continuum_loc.evaluation.tracks import Track, associate
 
 DOF = 6
 COVERAGE_BOUND = float(chi2.ppf(0.95, DOF))
@@ -21,7 +22,8 @@ COVERAGE_BOUND = float(chi2.ppf(0.95, DOF))
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors at K instants of the base and R rings (the base first, as in `Track`).
+    """
+    Errors at K instants of the base and R rings (the base first, as in `Track`).
 
     translation_m, rotation_deg: (K, R + 1).
     pose: (K, R + 1, 6) xi = Log(T_est^-1 T_true), [rho; phi], m and rad.
@@ -49,12 +51,17 @@ def errors(estimate: Track, truth: Track) -> Errors:
     covariance = matched.covariance
     if covariance is None:
         covariance = np.full((*pose.shape, DOF), np.nan)
-    with np.errstate(invalid="ignore"):  # a negative variance gives nan, which `nees` reports
+    with np.errstate(invalid='ignore'):  # a negative variance gives nan, which `nees` reports
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     return Errors(
-        stamps=matched.stamps, names=matched.names, translation_m=np.linalg.norm(offset, axis=-1),
-        rotation_deg=np.degrees(np.linalg.norm(pose[..., 3:], axis=-1)), pose=pose, sigma=sigma,
-        nees=nees(pose, covariance))
+        stamps=matched.stamps,
+        names=matched.names,
+        translation_m=np.linalg.norm(offset, axis=-1),
+        rotation_deg=np.degrees(np.linalg.norm(pose[..., 3:], axis=-1)),
+        pose=pose,
+        sigma=sigma,
+        nees=nees(pose, covariance),
+    )
 
 
 def nees(pose_error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -68,36 +75,61 @@ def nees(pose_error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def summarise(found: Errors) -> dict:
-    """Figures over all rings (the base is fixed by its mount, so it is reported apart), and for each ring alone.
-
-    Keys: translation_mae_m, translation_rmse_m, rotation_mae_deg, rotation_rmse_deg, each with `_std` of the error,
-    nees_per_dof, coverage_95, `rings` and `base` with the same keys.
     """
-    return {**_figures(found, slice(1, None)), "poses": int(found.translation_m[:, 1:].size),
-            "rings": {name: _figures(found, index) for index, name in enumerate(found.names) if index > 0},
-            "base": _figures(found, 0)}
+    Figures over all rings (the base is fixed by its mount, so it is reported apart), and for each
+    ring alone.
+
+    Keys: translation_mae_m, translation_rmse_m, rotation_mae_deg, rotation_rmse_deg, each with
+    `_std` of the error, nees_per_dof, coverage_95, `rings` and `base` with the same keys.
+    """
+    return {
+        **_figures(found, slice(1, None)),
+        'poses': int(found.translation_m[:, 1:].size),
+        'rings': {
+            name: _figures(found, index) for index, name in enumerate(found.names) if index > 0
+        },
+        'base': _figures(found, 0),
+    }
 
 
 def _figures(found: Errors, columns: int | slice) -> dict[str, float]:
     translation, rotation = found.translation_m[:, columns], found.rotation_deg[:, columns]
     if translation.size == 0:
-        return dict.fromkeys(FIGURES, float("nan"))
+        return dict.fromkeys(FIGURES, float('nan'))
     normalised = found.nees[:, columns]
     known = np.isfinite(normalised)
     # A covariance that is no covariance covers nothing: it stays in the denominator.
-    coverage = float(np.mean(known & (normalised <= COVERAGE_BOUND))) if known.any() else float("nan")
+    coverage = (
+        float(np.mean(known & (normalised <= COVERAGE_BOUND))) if known.any() else float('nan')
+    )
     return {
-        "translation_mae_m": float(translation.mean()), "translation_rmse_m": _rms(translation),
-        "translation_std_m": float(translation.std()), "translation_max_m": float(translation.max()),
-        "rotation_mae_deg": float(rotation.mean()), "rotation_rmse_deg": _rms(rotation),
-        "rotation_std_deg": float(rotation.std()), "rotation_max_deg": float(rotation.max()),
-        "nees_per_dof": float(normalised[known].mean() / DOF) if known.any() else float("nan"),
-        "coverage_95": coverage, "invalid_covariances": int((~known).sum())}
+        'translation_mae_m': float(translation.mean()),
+        'translation_rmse_m': _rms(translation),
+        'translation_std_m': float(translation.std()),
+        'translation_max_m': float(translation.max()),
+        'rotation_mae_deg': float(rotation.mean()),
+        'rotation_rmse_deg': _rms(rotation),
+        'rotation_std_deg': float(rotation.std()),
+        'rotation_max_deg': float(rotation.max()),
+        'nees_per_dof': float(normalised[known].mean() / DOF) if known.any() else float('nan'),
+        'coverage_95': coverage,
+        'invalid_covariances': int((~known).sum()),
+    }
 
 
-FIGURES = ("translation_mae_m", "translation_rmse_m", "translation_std_m", "translation_max_m", "rotation_mae_deg",
-           "rotation_rmse_deg", "rotation_std_deg", "rotation_max_deg", "nees_per_dof", "coverage_95",
-           "invalid_covariances")
+FIGURES = (
+    'translation_mae_m',
+    'translation_rmse_m',
+    'translation_std_m',
+    'translation_max_m',
+    'rotation_mae_deg',
+    'rotation_rmse_deg',
+    'rotation_std_deg',
+    'rotation_max_deg',
+    'nees_per_dof',
+    'coverage_95',
+    'invalid_covariances',
+)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -105,7 +137,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def drift_band(found: Errors, ring: int) -> tuple[np.ndarray, np.ndarray]:
-    """Three standard deviations of a ring's translation [m] and rotation [deg], each (K,): the root of the summed
-    variances, which bounds every direction."""
+    """
+    Three standard deviations of a ring's translation [m] and rotation [deg], each (K,): the root
+    of the summed variances, which bounds every direction.
+    """
     variance = found.sigma[:, ring] ** 2
-    return (3.0 * np.sqrt(variance[:, :3].sum(axis=1)), 3.0 * np.degrees(np.sqrt(variance[:, 3:].sum(axis=1))))
+    return (
+        3.0 * np.sqrt(variance[:, :3].sum(axis=1)),
+        3.0 * np.degrees(np.sqrt(variance[:, 3:].sum(axis=1))),
+    )

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+import hashlib
 from pathlib import Path
+import time
 from typing import Any, Protocol
 
-import numpy as np
-
 from continuum_loc.estimator.estimate import Estimate
-from continuum_loc.evaluation.tracks import Track, known_at
+from continuum_loc.evaluation.tracks import known_at, Track
 from continuum_loc.measurements import (
-    NANOSECONDS,
-    TOF_HALF_CONFIDENT,
-    TOF_VALID,
     EncoderSample,
     FieldSample,
     ImuSample,
     Measurement,
+    NANOSECONDS,
+    seconds,
     StrainSample,
+    TOF_HALF_CONFIDENT,
+    TOF_VALID,
     TofFrame,
     TrackedPose,
     TruthSample,
-    seconds,
 )
 from continuum_loc.robot import RobotDescription
+import numpy as np
 
 SAMPLES = (TofFrame, ImuSample, StrainSample, FieldSample, TrackedPose, EncoderSample, TruthSample)
 CLOUD_PERIOD = NANOSECONDS // 4  # of each sensor, one frame in this time is kept for pictures
@@ -53,14 +52,18 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class ReplayResult:
-    """What a run of the filter gave.
+    """
+    What a run of the filter gave.
 
-    track: the body at the newest instant of each step; lagged: the same at the smoothing lag (may be empty).
+    track: the body at the newest instant of each step; lagged: the same at the smoothing lag (may
+    be empty).
     truth: recorded truth (may be empty).
     consistency: (K,) mean normalised innovation squared at each step of `track`.
-    step_seconds: (N,) time of each step; latency_seconds: (N,) from sensor stamp to published pose (live runs only).
+    step_seconds: (N,) time of each step; latency_seconds: (N,) from sensor stamp to published pose
+    (live runs only).
     processing_seconds, data_seconds: time spent in the filter, and time that the data spans.
-    cpu_seconds: processor time of the same, over all threads: less than the former where others use the machine.
+    cpu_seconds: processor time of the same, over all threads: less than the former where others
+    use the machine.
     cloud: a share of the ToF points; counts: what the filter received, used and dropped, and why.
     """
 
@@ -74,12 +77,14 @@ class ReplayResult:
     cloud: Cloud
     counts: dict[str, Any]
     latency_seconds: np.ndarray = field(default_factory=lambda: np.empty(0))
-    cpu_seconds: float = float("nan")
+    cpu_seconds: float = float('nan')
 
     @property
     def real_time_factor(self) -> float:
         """Data time over processing time; nan when there was nothing to estimate."""
-        return self.data_seconds / self.processing_seconds if len(self.step_seconds) else float("nan")
+        return (
+            self.data_seconds / self.processing_seconds if len(self.step_seconds) else float('nan')
+        )
 
     @property
     def digest(self) -> str:
@@ -87,7 +92,7 @@ class ReplayResult:
         hashed = hashlib.sha256()
         for track in (self.track, self.lagged):
             for values in (track.stamps, track.T_map_ring, track.covariance):
-                hashed.update(b"-" if values is None else np.ascontiguousarray(values).tobytes())
+                hashed.update(b'-' if values is None else np.ascontiguousarray(values).tobytes())
         return hashed.hexdigest()
 
 
@@ -98,7 +103,9 @@ def samples_of(bag: str | Path) -> Iterator[Measurement | TruthSample]:
     return (item for _, item in read_bag(Path(bag)) if isinstance(item, SAMPLES))
 
 
-def replay(source: str | Path | Iterable[Measurement | TruthSample], estimator: Filter) -> ReplayResult:
+def replay(
+    source: str | Path | Iterable[Measurement | TruthSample], estimator: Filter
+) -> ReplayResult:
     """Feed a bag (its path) or samples in stamp order to `estimator`, in this thread, as fast as it goes."""
     samples = samples_of(source) if isinstance(source, (str, Path)) else source
     log = _Log(estimator.robot)
@@ -147,18 +154,26 @@ class _Log:
         track = Track.from_estimates(self.estimates, names)
         return ReplayResult(
             track=track,
-            lagged=Track.from_estimates((e.lagged for e in self.estimates if e.lagged is not None), names),
+            lagged=Track.from_estimates(
+                (e.lagged for e in self.estimates if e.lagged is not None), names
+            ),
             truth=Track.from_truth(self.truth, names),
             consistency=np.array([latest[stamp] for stamp in sorted(latest)], float),
-            step_seconds=np.array(self.step_seconds), processing_seconds=self.processing_seconds,
+            step_seconds=np.array(self.step_seconds),
+            processing_seconds=self.processing_seconds,
             data_seconds=max(seconds(self.last, self.first), 0.0) if self.last else 0.0,
-            cloud=place_points(self.frames, track, self.robot), counts=counts, cpu_seconds=self.cpu_seconds)
+            cloud=place_points(self.frames, track, self.robot),
+            counts=counts,
+            cpu_seconds=self.cpu_seconds,
+        )
 
 
 def place_points(frames: Iterable[TofFrame], track: Track, robot: RobotDescription) -> Cloud:
     """The valid points of `frames` in `map`, by the pose of their ring in `track` at their stamp."""
     frames = list(frames)
-    known = known_at(track.stamps, np.array([frame.stamp for frame in frames], np.int64), longest_gap=1.0)
+    known = known_at(
+        track.stamps, np.array([frame.stamp for frame in frames], np.int64), longest_gap=1.0
+    )
     frames = [frame for frame, usable in zip(frames, known, strict=True) if usable]
     if not frames:
         return Cloud(np.empty(0, np.int64), np.empty((0, 3)))
@@ -168,7 +183,9 @@ def place_points(frames: Iterable[TofFrame], track: Track, robot: RobotDescripti
     T_map_sensor = track.at(stamps)[np.arange(len(frames)), columns] @ T_ring_sensor
     placed, at = [], []
     for T, frame in zip(T_map_sensor, frames, strict=True):
-        valid = np.isin(frame.status, (TOF_VALID, *TOF_HALF_CONFIDENT)) & np.isfinite(frame.points).all(axis=1)
+        valid = np.isin(frame.status, (TOF_VALID, *TOF_HALF_CONFIDENT)) & np.isfinite(
+            frame.points
+        ).all(axis=1)
         placed.append(frame.points[valid] @ T[:3, :3].T + T[:3, 3])
         at.append(np.full(valid.sum(), frame.stamp, np.int64))
     return Cloud(np.concatenate(at), np.concatenate(placed))

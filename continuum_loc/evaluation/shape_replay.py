@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.measurements import FieldSample, ImuSample, Measurement
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import SettingsError
 from continuum_loc.shape import ShapeEstimate, ShapeEstimator, ShapeSettings
+import numpy as np
 
 
 class ShapeReplay:
-    """`ShapeEstimator` in the form that `replay.replay` asks of a filter: poses of the modules' rings.
+    """
+    `ShapeEstimator` in the form that `replay.replay` asks of a filter: poses of the modules'
+    rings.
 
-    The base is where the description says, exactly; strain and velocity are not estimated, and nan.
+    The base is where the description says, exactly; strain and velocity are not estimated, and
+    nan.
     """
 
     def __init__(self, robot: RobotDescription, settings: ShapeSettings) -> None:
         self.estimator = ShapeEstimator(robot, settings)
         if self.estimator.module_names != robot.ring_names:
-            raise SettingsError(f"robot '{robot.name}': shape needs a Hall sensor on every ring, in the rings' order; "
-                                f"rings: {', '.join(robot.ring_names)}; with Hall sensor: "
-                                f"{', '.join(self.estimator.module_names) or 'none'}")
+            raise SettingsError(
+                f"robot '{robot.name}': shape needs a Hall sensor on every ring, in the rings' order; "
+                f'rings: {", ".join(robot.ring_names)}; with Hall sensor: '
+                f'{", ".join(self.estimator.module_names) or "none"}'
+            )
         self.robot, self.settings = robot, settings
 
     @property
     def counts(self) -> dict:
         """What the estimator received and used."""
-        return {"samples": dict(self.estimator.counts)}
+        return {'samples': dict(self.estimator.counts)}
 
     def process(self, measurement: Measurement) -> Estimate | None:
         """One sample; kinds that shape does not use are passed by."""
@@ -48,8 +52,15 @@ def as_estimate(shape: ShapeEstimate, T_map_base: np.ndarray) -> Estimate:
     T_map_backbone = np.tile(np.eye(4), (len(shape.curve), 1, 1))
     T_map_backbone[:, :3, 3] = shape.curve
     return Estimate(
-        stamp=shape.stamp, T_map_ring=np.concatenate([T_map_base[None], shape.T_map_module]),
-        covariance=np.concatenate([np.full((1, 6, 6), np.nan), shape.covariance]), strain=unknown, velocity=unknown,
-        velocity_covariance=np.full((rings, 6, 6), np.nan), backbone_s=shape.curve_s, T_map_backbone=T_map_backbone,
-        status="lost" if shape.faults else "tracking", consistency=shape.consistency,
-        suspects=tuple(shape.faults))
+        stamp=shape.stamp,
+        T_map_ring=np.concatenate([T_map_base[None], shape.T_map_module]),
+        covariance=np.concatenate([np.full((1, 6, 6), np.nan), shape.covariance]),
+        strain=unknown,
+        velocity=unknown,
+        velocity_covariance=np.full((rings, 6, 6), np.nan),
+        backbone_s=shape.curve_s,
+        T_map_backbone=T_map_backbone,
+        status='lost' if shape.faults else 'tracking',
+        consistency=shape.consistency,
+        suspects=tuple(shape.faults),
+    )

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from continuum_loc.evaluation.trials import Trial
 
-# One hold-out per robot, as in the paper: a trajectory in a fully known environment, under a seed of its own.
-HOLD_OUT = {"engine": Trial(robot="engine", scene="S0", trajectory="t1", seed=1000),
-            "soft_arm": Trial(robot="soft_arm", scene="R4", trajectory="b1", seed=1000)}
+# One hold-out per robot, as in the paper: a trajectory in a fully known environment, under a seed
+# of its own.
+HOLD_OUT = {
+    'engine': Trial(robot='engine', scene='S0', trajectory='t1', seed=1000),
+    'soft_arm': Trial(robot='soft_arm', scene='R4', trajectory='b1', seed=1000),
+}
 
 
 class SplitError(ValueError):
@@ -16,8 +19,10 @@ class SplitError(ValueError):
 def hold_out(robot: str) -> Trial:
     """The hold-out of a bundled robot. Raises SplitError for a robot that has none."""
     if robot not in HOLD_OUT:
-        raise SplitError(f"robot '{robot}' has no hold-out of its own; give a bag and a map. Robots that have one: "
-                         f"{', '.join(HOLD_OUT)}")
+        raise SplitError(
+            f"robot '{robot}' has no hold-out of its own; give a bag and a map. Robots that have one: "
+            f'{", ".join(HOLD_OUT)}'
+        )
     return HOLD_OUT[robot]
 
 
@@ -31,4 +36,4 @@ def require_unseen(trials: list[Trial]) -> None:
     """Raises SplitError when a claim would rest on the scene and trajectory that the filter was tuned on."""
     seen = sorted({trial.name for trial in trials if is_hold_out(trial)})
     if seen:
-        raise SplitError(f"tuned on, so no claim may rest on it: {', '.join(seen)}")
+        raise SplitError(f'tuned on, so no claim may rest on it: {", ".join(seen)}')

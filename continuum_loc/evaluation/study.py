@@ -1,33 +1,45 @@
-"""Studies: experiments that end in claims, each a figure beside the bound it has to keep.
+"""
+Studies: experiments that end in claims, each a figure beside the bound it has to keep.
 
-A study NAME is the module `continuum_loc.evaluation.studies.NAME`. It has a docstring, whose first line the
-command line shows, and
+A study NAME is the module `continuum_loc.evaluation.studies.NAME`. It has a docstring, whose first
+line the command line shows, and
 
     def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]
 
-which does the work, leaves its results under `out` through `write_study`, and returns the same claims.
+which does the work, leaves its results under `out` through `write_study`, and returns the same
+claims.
 """
 
 from __future__ import annotations
 
-import difflib
-import importlib
-import json
-import math
-import pkgutil
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
+import difflib
+import importlib
 from importlib import metadata
+import json
+import math
 from pathlib import Path
+import pkgutil
+import platform
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-REPORTED_PACKAGES = ("continuum_loc", "numpy", "scipy", "numba", "mujoco", "pydantic", "pandas", "open3d", "rclpy")
+REPORTED_PACKAGES = (
+    'continuum_loc',
+    'numpy',
+    'scipy',
+    'numba',
+    'mujoco',
+    'pydantic',
+    'pandas',
+    'open3d',
+    'rclpy',
+)
 
-StudyRun = Callable[[Path, bool, int, int], "list[Claim]"]
+StudyRun = Callable[[Path, bool, int, int], 'list[Claim]']
 
 
 class StudyError(ValueError):
@@ -48,24 +60,28 @@ class Claim:
 # A value that is not a number holds no bound: every comparison below is false for nan.
 def at_most(name: str, value: float, unit: str, limit: float) -> Claim:
     """The claim value <= limit."""
-    return Claim(name, float(value), unit, f"<= {limit:g}", bool(value <= limit))
+    return Claim(name, float(value), unit, f'<= {limit:g}', bool(value <= limit))
 
 
 def at_least(name: str, value: float, unit: str, limit: float) -> Claim:
     """The claim value >= limit."""
-    return Claim(name, float(value), unit, f">= {limit:g}", bool(value >= limit))
+    return Claim(name, float(value), unit, f'>= {limit:g}', bool(value >= limit))
 
 
 def between(name: str, value: float, unit: str, low: float, high: float) -> Claim:
     """The claim low <= value <= high."""
-    return Claim(name, float(value), unit, f"{low:g} to {high:g}", bool(low <= value <= high))
+    return Claim(name, float(value), unit, f'{low:g} to {high:g}', bool(low <= value <= high))
 
 
 def study_names() -> list[str]:
     """Names of the studies that come with the package."""
     from continuum_loc.evaluation import studies
 
-    return sorted(module.name for module in pkgutil.iter_modules(studies.__path__) if not module.name.startswith("_"))
+    return sorted(
+        module.name
+        for module in pkgutil.iter_modules(studies.__path__)
+        if not module.name.startswith('_')
+    )
 
 
 def load_study(name: str) -> StudyRun:
@@ -73,16 +89,26 @@ def load_study(name: str) -> StudyRun:
     names = study_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-        hint = f" (did you mean '{close[0]}'?)" if close else ""
+        hint = f" (did you mean '{close[0]}'?)" if close else ''
         raise StudyError(f"no study '{name}'{hint}; studies: {', '.join(names) or 'none'}")
-    return importlib.import_module(f"continuum_loc.evaluation.studies.{name}").run
+    return importlib.import_module(f'continuum_loc.evaluation.studies.{name}').run
 
 
-def write_study(out: Path, claims: Sequence[Claim], *, seed: int, settings: Any = None,
-                tables: Mapping[str, Any] | None = None, extra: Mapping[str, Any] | None = None) -> Path:
-    """Write `out/summary.json` (claims, seed, versions, configuration) and each table as CSV, JSON, Markdown and LaTeX.
+def write_study(
+    out: Path,
+    claims: Sequence[Claim],
+    *,
+    seed: int,
+    settings: Any = None,
+    tables: Mapping[str, Any] | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> Path:
+    """
+    Write `out/summary.json` (claims, seed, versions, configuration) and each table as CSV, JSON,
+    Markdown and LaTeX.
 
-    settings: the configuration of the study: pydantic settings, a dataclass or plain mappings of them.
+    settings: the configuration of the study: pydantic settings, a dataclass or plain mappings of
+    them.
     tables: by name, a pandas DataFrame or a list of rows (mappings).
     extra: further keys of the summary.
     Returns the path of the summary.
@@ -93,16 +119,22 @@ def write_study(out: Path, claims: Sequence[Claim], *, seed: int, settings: Any 
     out.mkdir(parents=True, exist_ok=True)
     for name, table in (tables or {}).items():
         write_table(table, out / name)
-    summary = {"claims": list(claims), "seed": seed, "versions": versions(), "configuration": settings,
-               "tables": sorted(tables or {}), **(extra or {})}
-    path = out / "summary.json"
+    summary = {
+        'claims': list(claims),
+        'seed': seed,
+        'versions': versions(),
+        'configuration': settings,
+        'tables': sorted(tables or {}),
+        **(extra or {}),
+    }
+    path = out / 'summary.json'
     write_json(path, summary)
     return path
 
 
 def versions() -> dict[str, str]:
     """Versions of Python, the platform and the packages that a result depends on."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
+    found = {'python': platform.python_version(), 'platform': platform.platform()}
     for name in REPORTED_PACKAGES:
         try:
             found[name] = metadata.version(name)
@@ -113,7 +145,7 @@ def versions() -> dict[str, str]:
 
 def write_json(path: Path, content: Any) -> None:
     """Write strict JSON: arrays as lists, settings and dataclasses as mappings, not-finite numbers as null."""
-    Path(path).write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
+    Path(path).write_text(json.dumps(plain(content), indent=2, allow_nan=False) + '\n')
 
 
 def plain(value: Any) -> Any:
@@ -127,7 +159,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, BaseModel):
-        return plain(value.model_dump(mode="json"))
+        return plain(value.model_dump(mode='json'))
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
@@ -136,4 +168,4 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, Path):
         return str(value)
-    raise TypeError(f"cannot write a {type(value).__name__} as JSON: {value!r}")
+    raise TypeError(f'cannot write a {type(value).__name__} as JSON: {value!r}')

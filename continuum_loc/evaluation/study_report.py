@@ -8,29 +8,50 @@ from pathlib import Path
 from typing import Any
 
 from continuum_loc.evaluation.campaign import Outcome
-from continuum_loc.evaluation.report import Page, Part, Row, Table, context_of, render, run_page
+from continuum_loc.evaluation.report import context_of, Page, Part, render, Row, run_page, Table
 from continuum_loc.evaluation.runs import load_run
 from continuum_loc.evaluation.study import Claim
 
 WORST_TRIALS = 12
 
 
-def write_study_report(out: Path, title: str, claims: Sequence[Claim], tables: dict[str, list[dict[str, Any]]],
-                       outcomes: Sequence[Outcome]) -> Path:
+def write_study_report(
+    out: Path,
+    title: str,
+    claims: Sequence[Claim],
+    tables: dict[str, list[dict[str, Any]]],
+    outcomes: Sequence[Outcome],
+) -> Path:
     """Write `out/report.html`. `tables` by title, as rows; the worst trial is the one with the greatest mean error."""
-    ranked = sorted((one for one in outcomes if one.summary is not None),
-                    key=lambda one: -(one.summary["translation_mae_m"] or 0.0))
+    ranked = sorted(
+        (one for one in outcomes if one.summary is not None),
+        key=lambda one: -(one.summary['translation_mae_m'] or 0.0),
+    )
     failed = [one for one in outcomes if one.summary is None]
     held = sum(claim.holds for claim in claims)
-    cards = [("claims that hold", f"{held} of {len(claims)}"), ("trials", str(len(ranked))),
-             ("failed trials", str(len(failed)))]
-    groups = [[claims_part(claims)], *([Part(name, table=as_table(rows))] for name, rows in tables.items()),
-              [worst_part(ranked)]]
+    cards = [
+        ('claims that hold', f'{held} of {len(claims)}'),
+        ('trials', str(len(ranked))),
+        ('failed trials', str(len(failed))),
+    ]
+    groups = [
+        [claims_part(claims)],
+        *([Part(name, table=as_table(rows))] for name, rows in tables.items()),
+        [worst_part(ranked)],
+    ]
     if failed:
-        groups.append([Part("Failed trials", table=as_table([{"trial": one.trial.name, "error": one.error}
-                                                             for one in failed]))])
-    page = Page(title, f"{len(outcomes)} trials", cards, groups)
-    path = out / "report.html"
+        groups.append(
+            [
+                Part(
+                    'Failed trials',
+                    table=as_table(
+                        [{'trial': one.trial.name, 'error': one.error} for one in failed]
+                    ),
+                )
+            ]
+        )
+    page = Page(title, f'{len(outcomes)} trials', cards, groups)
+    path = out / 'report.html'
     path.write_text(render(with_worst_trial(page, out, ranked)))
     return path
 
@@ -39,33 +60,70 @@ def with_worst_trial(page: Page, out: Path, ranked: Sequence[Outcome]) -> Page:
     """The page, followed by everything that the report of the worst trial shows."""
     if not ranked:
         return page
-    run = load_run(out / "trials" / ranked[0].trial.name)
+    run = load_run(out / 'trials' / ranked[0].trial.name)
     worst = run_page(run, context_of(run))
-    head = Part(f"The worst trial: {worst.title}", worst.subtitle)
-    return replace(page, groups=[*page.groups, [head], *worst.groups], configuration=worst.configuration)
+    head = Part(f'The worst trial: {worst.title}', worst.subtitle)
+    return replace(
+        page, groups=[*page.groups, [head], *worst.groups], configuration=worst.configuration
+    )
 
 
 def claims_part(claims: Sequence[Claim]) -> Part:
     """The claims, those that fail first."""
-    rows = [Row([claim.name, f"{claim.value:.4g}", claim.unit, claim.bound, "yes" if claim.holds else "no"])
-            for claim in sorted(claims, key=lambda claim: claim.holds)]
-    return Part("Claims", table=Table(["claim", "value", "unit", "bound", "holds"], rows, words=(0, 2, 3, 4)))
+    rows = [
+        Row(
+            [
+                claim.name,
+                f'{claim.value:.4g}',
+                claim.unit,
+                claim.bound,
+                'yes' if claim.holds else 'no',
+            ]
+        )
+        for claim in sorted(claims, key=lambda claim: claim.holds)
+    ]
+    return Part(
+        'Claims',
+        table=Table(['claim', 'value', 'unit', 'bound', 'holds'], rows, words=(0, 2, 3, 4)),
+    )
 
 
 def worst_part(ranked: Sequence[Outcome]) -> Part:
     """The trials with the greatest mean error, the worst first."""
-    rows = [Row([one.trial.name, f"{100 * one.summary['translation_mae_m']:.2f}",
-                 f"{100 * one.summary['translation_max_m']:.2f}", f"{one.summary['rotation_mae_deg']:.2f}",
-                 f"{one.summary['estimates']['lost']} of {one.summary['estimates']['all']}"])
-            for one in ranked[:WORST_TRIALS]]
-    return Part("Worst trials first", "Each has a run folder under trials/; `continuum-loc report` makes its page.",
-                Table(["trial (map, robot, scene, trajectory)", "MAE cm", "max cm", "MAE deg", "said lost"], rows))
+    rows = [
+        Row(
+            [
+                one.trial.name,
+                f'{100 * one.summary["translation_mae_m"]:.2f}',
+                f'{100 * one.summary["translation_max_m"]:.2f}',
+                f'{one.summary["rotation_mae_deg"]:.2f}',
+                f'{one.summary["estimates"]["lost"]} of {one.summary["estimates"]["all"]}',
+            ]
+        )
+        for one in ranked[:WORST_TRIALS]
+    ]
+    return Part(
+        'Worst trials first',
+        'Each has a run folder under trials/; `continuum-loc report` makes its page.',
+        Table(
+            ['trial (map, robot, scene, trajectory)', 'MAE cm', 'max cm', 'MAE deg', 'said lost'],
+            rows,
+        ),
+    )
 
 
 def as_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Rows of mappings with equal keys as a table of the page."""
     columns = list(rows[0]) if rows else []
-    words = [index for index, name in enumerate(columns) if rows and isinstance(rows[0][name], str)]
+    words = [
+        index for index, name in enumerate(columns) if rows and isinstance(rows[0][name], str)
+    ]
     # A mean and its deviation stay on one line.
-    return Table(columns, [Row([str(row[name]).replace(" ± ", "\u00a0±\u00a0") for name in columns]) for row in rows],
-                 words)
+    return Table(
+        columns,
+        [
+            Row([str(row[name]).replace(' ± ', '\u00a0±\u00a0') for name in columns])
+            for row in rows
+        ],
+        words,
+    )

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     import pandas as pd
 
-LATEX_SPECIAL = str.maketrans({"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
-                               "±": r"$\pm$", "≤": r"$\le$", "≥": r"$\ge$", "°": r"$^\circ$"})
+LATEX_SPECIAL = str.maketrans(
+    {
+        '&': r'\&',
+        '%': r'\%',
+        '_': r'\_',
+        '#': r'\#',
+        '$': r'\$',
+        '{': r'\{',
+        '}': r'\}',
+        '±': r'$\pm$',
+        '≤': r'$\le$',
+        '≥': r'$\ge$',
+        '°': r'$^\circ$',
+    }
+)
 
 
 def write_table(table: pd.DataFrame | Sequence[Mapping[str, Any]], stem: Path) -> None:
@@ -20,27 +33,45 @@ def write_table(table: pd.DataFrame | Sequence[Mapping[str, Any]], stem: Path) -
 
     frame = table if isinstance(table, pd.DataFrame) else pd.DataFrame(list(table))
     stem.parent.mkdir(parents=True, exist_ok=True)
-    frame.to_csv(stem.with_suffix(".csv"), index=False)
-    frame.to_json(stem.with_suffix(".json"), orient="records", indent=2, double_precision=15)
-    stem.with_suffix(".md").write_text(markdown(frame))
-    stem.with_suffix(".tex").write_text(latex(frame))
+    frame.to_csv(stem.with_suffix('.csv'), index=False)
+    frame.to_json(stem.with_suffix('.json'), orient='records', indent=2, double_precision=15)
+    stem.with_suffix('.md').write_text(markdown(frame))
+    stem.with_suffix('.tex').write_text(latex(frame))
 
 
 def markdown(frame: pd.DataFrame) -> str:
     """A GitHub table: text left, numbers right with four significant digits."""
     header = [str(name) for name in frame.columns]
-    ruler = ["---:" if kind in "iuf" else "---" for kind in (frame[name].dtype.kind for name in frame.columns)]
+    ruler = [
+        '---:' if kind in 'iuf' else '---'
+        for kind in (frame[name].dtype.kind for name in frame.columns)
+    ]
     lines = [header, ruler, *_cells(frame)]
-    return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in lines)
+    return ''.join(
+        '| ' + ' | '.join(cell.replace('|', r'\|') for cell in line) + ' |\n' for line in lines
+    )
 
 
 def latex(frame: pd.DataFrame) -> str:
-    """A booktabs tabular, ready to be \\input."""
-    columns = "".join("r" if frame[name].dtype.kind in "iuf" else "l" for name in frame.columns)
-    rows = [" & ".join(cell.translate(LATEX_SPECIAL) for cell in line) + r" \\" for line in _cells(frame)]
-    head = " & ".join(str(name).translate(LATEX_SPECIAL) for name in frame.columns) + r" \\"
-    return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\toprule", head, r"\midrule", *rows, r"\bottomrule",
-                      r"\end{tabular}", ""])
+    r"""A booktabs tabular, ready to be \\input."""
+    columns = ''.join('r' if frame[name].dtype.kind in 'iuf' else 'l' for name in frame.columns)
+    rows = [
+        ' & '.join(cell.translate(LATEX_SPECIAL) for cell in line) + r' \\'
+        for line in _cells(frame)
+    ]
+    head = ' & '.join(str(name).translate(LATEX_SPECIAL) for name in frame.columns) + r' \\'
+    return '\n'.join(
+        [
+            rf'\begin{{tabular}}{{{columns}}}',
+            r'\toprule',
+            head,
+            r'\midrule',
+            *rows,
+            r'\bottomrule',
+            r'\end{tabular}',
+            '',
+        ]
+    )
 
 
 def _cells(frame: pd.DataFrame) -> list[list[str]]:
@@ -49,7 +80,7 @@ def _cells(frame: pd.DataFrame) -> list[list[str]]:
 
 def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "-"
+        return '-'
     if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+        return 'yes' if value else 'no'
+    return f'{value:.4g}' if isinstance(value, float) else str(value)

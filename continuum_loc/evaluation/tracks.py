@@ -6,14 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.measurements import NANOSECONDS, TruthSample
+import numpy as np
+from scipy.spatial.transform import Rotation
 
-BASE = "base"
+BASE = 'base'
 
 
 class TrackError(ValueError):
@@ -22,12 +21,14 @@ class TrackError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """K instants of a body with R rings.
+    """
+    K instants of a body with R rings.
 
     stamps: (K,) int64 nanoseconds, strictly increasing.
     names: R + 1 names, the base first, then the rings from base to tip.
     T_map_ring: (K, R + 1, 4, 4).
-    covariance: (K, R + 1, 6, 6) of a right perturbation, [rho; phi] order, or None (truth has none).
+    covariance: (K, R + 1, 6, 6) of a right perturbation, [rho; phi] order, or None (truth has
+    none).
     status: (K,) strings (`initialising`, `tracking`, `lost`), or None.
     backbone: (K, B, 3) points of the backbone in `map` [m], base to tip, or None.
     """
@@ -41,13 +42,19 @@ class Track:
 
     def __post_init__(self) -> None:
         count, rings = len(self.stamps), len(self.names)
-        expected = {"T_map_ring": (count, rings, 4, 4), "covariance": (count, rings, 6, 6), "status": (count,)}
+        expected = {
+            'T_map_ring': (count, rings, 4, 4),
+            'covariance': (count, rings, 6, 6),
+            'status': (count,),
+        }
         for name, shape in expected.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
-                raise TrackError(f"{name} has shape {value.shape}, expected {shape} (stamps, base and rings)")
+                raise TrackError(
+                    f'{name} has shape {value.shape}, expected {shape} (stamps, base and rings)'
+                )
         if np.any(np.diff(self.stamps) <= 0):
-            raise TrackError("stamps must increase strictly, as `Track.from_estimates` arranges")
+            raise TrackError('stamps must increase strictly, as `Track.from_estimates` arranges')
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -61,11 +68,13 @@ class Track:
         if not ordered:
             return cls.empty(names)
         return cls(
-            stamps=np.array([estimate.stamp for estimate in ordered], np.int64), names=names,
+            stamps=np.array([estimate.stamp for estimate in ordered], np.int64),
+            names=names,
             T_map_ring=np.stack([estimate.T_map_ring for estimate in ordered]),
             covariance=np.stack([estimate.covariance for estimate in ordered]),
             status=np.array([estimate.status for estimate in ordered]),
-            backbone=np.stack([estimate.T_map_backbone[:, :3, 3] for estimate in ordered]))
+            backbone=np.stack([estimate.T_map_backbone[:, :3, 3] for estimate in ordered]),
+        )
 
     @classmethod
     def from_truth(cls, samples: Iterable[TruthSample], ring_names: Sequence[str]) -> Track:
@@ -77,9 +86,13 @@ class Track:
         stamps = sorted(latest)
         odd = next((stamp for stamp in stamps if latest[stamp].shape != (len(names), 4, 4)), None)
         if odd is not None:
-            raise TrackError(f"the truth at {odd / NANOSECONDS:.3f} s holds {len(latest[odd])} poses; this robot has "
-                             f"{len(names)}: {', '.join(names)}")
-        return cls(np.array(stamps, np.int64), names, np.stack([latest[stamp] for stamp in stamps]))
+            raise TrackError(
+                f'the truth at {odd / NANOSECONDS:.3f} s holds {len(latest[odd])} poses; this robot has '
+                f'{len(names)}: {", ".join(names)}'
+            )
+        return cls(
+            np.array(stamps, np.int64), names, np.stack([latest[stamp] for stamp in stamps])
+        )
 
     @classmethod
     def empty(cls, names: Sequence[str]) -> Track:
@@ -88,31 +101,50 @@ class Track:
 
     def select(self, mask: np.ndarray) -> Track:
         """The instants where `mask` (K,) is true."""
+
         def pick(value: np.ndarray | None) -> np.ndarray | None:
             return None if value is None else value[mask]
-        return Track(self.stamps[mask], self.names, self.T_map_ring[mask], pick(self.covariance), pick(self.status),
-                     pick(self.backbone))
+
+        return Track(
+            self.stamps[mask],
+            self.names,
+            self.T_map_ring[mask],
+            pick(self.covariance),
+            pick(self.status),
+            pick(self.backbone),
+        )
 
     def at(self, stamps: np.ndarray) -> np.ndarray:
-        """Poses (N, R + 1, 4, 4) at `stamps` (N,) inside the track, along the geodesic between its neighbours:
-        T(u) = T_a Exp(u Log(T_a^-1 T_b)). Raises TrackError for stamps outside."""
+        """
+        Poses (N, R + 1, 4, 4) at `stamps` (N,) inside the track, along the geodesic between its
+        neighbours: T(u) = T_a Exp(u Log(T_a^-1 T_b)). Raises TrackError for stamps outside.
+        """
         stamps = np.asarray(stamps, np.int64)
-        if len(stamps) and (len(self) < 2 or stamps.min() < self.stamps[0] or stamps.max() > self.stamps[-1]):
-            raise TrackError("a track can only be asked for instants between its first and its last stamp")
-        after = np.clip(np.searchsorted(self.stamps, stamps, side="right"), 1, max(len(self) - 1, 1))
+        if len(stamps) and (
+            len(self) < 2 or stamps.min() < self.stamps[0] or stamps.max() > self.stamps[-1]
+        ):
+            raise TrackError(
+                'a track can only be asked for instants between its first and its last stamp'
+            )
+        after = np.clip(
+            np.searchsorted(self.stamps, stamps, side='right'), 1, max(len(self) - 1, 1)
+        )
         start, span = self.stamps[after - 1], self.stamps[after] - self.stamps[after - 1]
         share = ((stamps - start) / span)[:, None]
         return lie.interpolate(self.T_map_ring[after - 1], self.T_map_ring[after], share)
 
 
 def associate(estimate: Track, truth: Track, longest_gap: float = 0.2) -> tuple[Track, Track]:
-    """The estimate where truth is known, and the truth interpolated to the estimate's stamps.
+    """
+    The estimate where truth is known, and the truth interpolated to the estimate's stamps.
 
     Instants outside the truth, or inside a gap of it longer than `longest_gap` [s], are left out.
     """
     if estimate.names != truth.names:
-        raise TrackError(f"estimate and truth describe different bodies: {', '.join(estimate.names)} against "
-                         f"{', '.join(truth.names)}")
+        raise TrackError(
+            f'estimate and truth describe different bodies: {", ".join(estimate.names)} against '
+            f'{", ".join(truth.names)}'
+        )
     known = known_at(truth.stamps, estimate.stamps, longest_gap)
     matched = estimate.select(known)
     return matched, Track(matched.stamps, truth.names, truth.at(matched.stamps))
@@ -122,7 +154,7 @@ def known_at(reference: np.ndarray, stamps: np.ndarray, longest_gap: float) -> n
     """(K,) whether each stamp is one of `reference`'s, or lies between two of them at most `longest_gap` [s] apart."""
     if len(reference) < 2:
         return np.zeros(len(stamps), bool)
-    after = np.clip(np.searchsorted(reference, stamps, side="right"), 1, len(reference) - 1)
+    after = np.clip(np.searchsorted(reference, stamps, side='right'), 1, len(reference) - 1)
     inside = (stamps >= reference[0]) & (stamps <= reference[-1])
     near = reference[after] - reference[after - 1] <= longest_gap * NANOSECONDS
     return inside & (near | (stamps == reference[after - 1]))
@@ -132,42 +164,60 @@ def save_tum(track: Track, folder: str | Path, prefix: str) -> list[Path]:
     """Write `folder/PREFIX_NAME.tum` for the base and each ring: lines `t x y z qx qy qz qw`, t in seconds to 1 ns."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    times = [f"{stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d}" for stamp in track.stamps.tolist()]
+    times = [
+        f'{stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d}' for stamp in track.stamps.tolist()
+    ]
     paths = []
     for index, name in enumerate(track.names):
         T_map_ring = track.T_map_ring[:, index]
         values = np.empty((len(track), 7))
         values[:, :3] = T_map_ring[:, :3, 3]
-        values[:, 3:] = Rotation.from_matrix(T_map_ring[:, :3, :3]).as_quat() if len(track) else 0.0
-        path = folder / f"{prefix}_{name}.tum"
-        path.write_text("".join(f"{time} {' '.join(f'{value:.12g}' for value in row)}\n"
-                                for time, row in zip(times, values.tolist(), strict=True)))
+        values[:, 3:] = (
+            Rotation.from_matrix(T_map_ring[:, :3, :3]).as_quat() if len(track) else 0.0
+        )
+        path = folder / f'{prefix}_{name}.tum'
+        path.write_text(
+            ''.join(
+                f'{time} {" ".join(f"{value:.12g}" for value in row)}\n'
+                for time, row in zip(times, values.tolist(), strict=True)
+            )
+        )
         paths.append(path)
     return paths
 
 
 def load_tum(folder: str | Path, prefix: str, names: Sequence[str]) -> Track:
     """Read back what `save_tum` wrote. Raises TrackError naming the file and line."""
-    read = [_read_tum(Path(folder) / f"{prefix}_{name}.tum") for name in names]
+    read = [_read_tum(Path(folder) / f'{prefix}_{name}.tum') for name in names]
     stamps = read[0][0]
     for name, (other, _) in zip(names, read, strict=True):
         if not np.array_equal(stamps, other):
-            raise TrackError(f"{folder}: {prefix}_{name}.tum has other stamps than {prefix}_{names[0]}.tum")
+            raise TrackError(
+                f'{folder}: {prefix}_{name}.tum has other stamps than {prefix}_{names[0]}.tum'
+            )
     return Track(stamps, tuple(names), np.stack([poses for _, poses in read], axis=1))
 
 
 def _read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (K,) and poses (K, 4, 4) of one TUM file."""
     try:
-        lines = [line.split() for line in path.read_text().splitlines() if line and not line.startswith("#")]
+        lines = [
+            line.split()
+            for line in path.read_text().splitlines()
+            if line and not line.startswith('#')
+        ]
     except OSError as error:
-        raise TrackError(f"{path}: cannot be read ({error.strerror})") from None
+        raise TrackError(f'{path}: cannot be read ({error.strerror})') from None
     try:
         stamps = np.array([_exact_stamp(fields[0]) for fields in lines], np.int64)
         values = np.array([fields[1:] for fields in lines], float).reshape(-1, 7)
-        rotations = Rotation.from_quat(values[:, 3:]).as_matrix() if len(values) else np.empty((0, 3, 3))
+        rotations = (
+            Rotation.from_quat(values[:, 3:]).as_matrix() if len(values) else np.empty((0, 3, 3))
+        )
     except (ValueError, IndexError) as error:
-        raise TrackError(f"{path}: every line must hold the 8 numbers `t x y z qx qy qz qw` ({error})") from None
+        raise TrackError(
+            f'{path}: every line must hold the 8 numbers `t x y z qx qy qz qw` ({error})'
+        ) from None
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = values[:, :3]
@@ -176,5 +226,5 @@ def _read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _exact_stamp(text: str) -> int:
     """Nanoseconds of decimal seconds; a float would lose them."""
-    whole, _, fraction = text.partition(".")
-    return int(whole) * NANOSECONDS + int(fraction[:9].ljust(9, "0"))
+    whole, _, fraction = text.partition('.')
+    return int(whole) * NANOSECONDS + int(fraction[:9].ljust(9, '0'))

@@ -1,18 +1,20 @@
-"""One trial: a robot simulated in a scene, a prior map, and the filter over the samples. Studies, tests and the
-command line all build their trials here."""
+"""
+One trial: a robot simulated in a scene, a prior map, and the filter over the samples. Studies,
+tests and the command line all build their trials here.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+import hashlib
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
-from continuum_loc.evaluation.replay import Filter, ReplayResult, replay
+from continuum_loc.evaluation.replay import Filter, replay, ReplayResult
 from continuum_loc.measurements import Measurement, TrackedPose, TruthSample
-from continuum_loc.robot import RobotDescription, load_robot
+from continuum_loc.robot import load_robot, RobotDescription
 
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
@@ -20,31 +22,40 @@ if TYPE_CHECKING:
     from continuum_loc.simulator.world import World
 
 MAP_POINTS = 300_000
-# What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF stamps share.
+# What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF
+# stamps share.
 MOUNTING_ERROR = (0.002, 1.0)  # m, deg
 GYRO_BIAS = 0.01  # rad/s
 TOF_CLOCK_OFFSET = 0.010  # s
 
-TOPICS = {"TofFrame": "tof/points", "ImuSample": "imu/data_raw", "FieldSample": "imu/mag", "StrainSample": "strain",
-          "EncoderSample": "joint_states", "TruthSample": "ground_truth/poses"}
+TOPICS = {
+    'TofFrame': 'tof/points',
+    'ImuSample': 'imu/data_raw',
+    'FieldSample': 'imu/mag',
+    'StrainSample': 'strain',
+    'EncoderSample': 'joint_states',
+    'TruthSample': 'ground_truth/poses',
+}
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What decides a simulated trial.
+    """
+    What decides a simulated trial.
 
-    robot: a bundled name or a YAML file. scene, map_scene: scene names or mesh files; the prior map is that of
-    `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity: `paper` or `vl53l5cx`.
+    robot: a bundled name or a YAML file. scene, map_scene: scene names or mesh files; the prior
+    map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
+    `paper` or `vl53l5cx`.
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
     duration: seconds; None for the trajectory's own.
     """
 
-    robot: str = "engine"
-    scene: str = "S0"
-    trajectory: str = "t1"
+    robot: str = 'engine'
+    scene: str = 'S0'
+    trajectory: str = 't1'
     map_scene: str | None = None
-    profile: str = "live"
-    fidelity: str = "paper"
+    profile: str = 'live'
+    fidelity: str = 'paper'
     disturbed: bool = False
     seed: int = 0
     duration: float | None = None
@@ -52,14 +63,25 @@ class Trial:
     @property
     def recording(self) -> str:
         """Name of what is simulated; trials that differ in the map alone share it."""
-        length = "" if self.duration is None else f"-{self.duration:g}s"
-        return "-".join([Path(self.robot).stem, Path(self.scene).stem, self.trajectory, self.fidelity, self.profile]
-                        + ["disturbed"] * self.disturbed) + f"-{self.seed}{length}"
+        length = '' if self.duration is None else f'-{self.duration:g}s'
+        return (
+            '-'.join(
+                [
+                    Path(self.robot).stem,
+                    Path(self.scene).stem,
+                    self.trajectory,
+                    self.fidelity,
+                    self.profile,
+                ]
+                + ['disturbed'] * self.disturbed
+            )
+            + f'-{self.seed}{length}'
+        )
 
     @property
     def name(self) -> str:
         """Unique among trials."""
-        return f"{Path(self.map_scene or self.scene).stem}-map-{self.recording}"
+        return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
 
 
 def world(trial: Trial, faults: tuple = ()) -> World:
@@ -70,16 +92,29 @@ def world(trial: Trial, faults: tuple = ()) -> World:
     robot = load_robot(trial.robot)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
-    return World(robot, load_scene(trial.scene) if robot.tof else None, trial.trajectory, profile=trial.profile,
-                 tof_fidelity=trial.fidelity, seed=trial.seed, faults=faults)
+    return World(
+        robot,
+        load_scene(trial.scene) if robot.tof else None,
+        trial.trajectory,
+        profile=trial.profile,
+        tof_fidelity=trial.fidelity,
+        seed=trial.seed,
+        faults=faults,
+    )
 
 
-def _disturbed(robot: RobotDescription, seed: int, faults: tuple) -> tuple[RobotDescription, tuple]:
+def _disturbed(
+    robot: RobotDescription, seed: int, faults: tuple
+) -> tuple[RobotDescription, tuple]:
     """The robot as it truly is, and its clocks."""
     from continuum_loc.simulator.faults import ClockOffset, miscalibrated
 
-    biased = robot.model_copy(update={"imu_model": robot.imu_model.model_copy(update={"gyro_bias_sigma": GYRO_BIAS})})
-    clock = ClockOffset(sensors=tuple(sensor.name for sensor in robot.tof), offset=TOF_CLOCK_OFFSET)
+    biased = robot.model_copy(
+        update={'imu_model': robot.imu_model.model_copy(update={'gyro_bias_sigma': GYRO_BIAS})}
+    )
+    clock = ClockOffset(
+        sensors=tuple(sensor.name for sensor in robot.tof), offset=TOF_CLOCK_OFFSET
+    )
     return miscalibrated(biased, *MOUNTING_ERROR, seed=seed), (*faults, clock)
 
 
@@ -91,8 +126,12 @@ def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSa
 def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
     """Simulate and estimate, both in this thread; only the estimator is timed."""
     robot = load_robot(trial.robot)
-    return replay(simulate(trial), make_filter(robot, scene_map(trial.map_scene or trial.scene),
-                                               settings or trial_settings(trial)))
+    return replay(
+        simulate(trial),
+        make_filter(
+            robot, scene_map(trial.map_scene or trial.scene), settings or trial_settings(trial)
+        ),
+    )
 
 
 def trial_settings(trial: Trial) -> EstimatorSettings:
@@ -100,14 +139,15 @@ def trial_settings(trial: Trial) -> EstimatorSettings:
     from continuum_loc.estimator.settings import PRESETS_FOLDER, settings_of
 
     robot = load_robot(trial.robot).name
-    special = f"{robot}_{trial.fidelity}"
-    return settings_of(special if (PRESETS_FOLDER / f"{special}.yaml").is_file() else robot)
+    special = f'{robot}_{trial.fidelity}'
+    return settings_of(special if (PRESETS_FOLDER / f'{special}.yaml').is_file() else robot)
 
 
-def make_filter(robot: RobotDescription, prior_map: PriorMap | None,
-                settings: EstimatorSettings | None = None) -> Filter:
+def make_filter(
+    robot: RobotDescription, prior_map: PriorMap | None, settings: EstimatorSettings | None = None
+) -> Filter:
     """The sliding-window filter, by default with the settings that come with the robot."""
-    from continuum_loc.estimator import SlidingWindowFilter, settings_of
+    from continuum_loc.estimator import settings_of, SlidingWindowFilter
 
     return SlidingWindowFilter(robot, prior_map, settings or settings_of(robot.name))
 
@@ -126,10 +166,12 @@ def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int =
 
     scene = load_scene(scene_name)
     digest = hashlib.sha256(scene.vertices.tobytes() + scene.faces.tobytes()).hexdigest()[:16]
-    path = map_cache() / f"{Path(scene_name).stem}-{points}-{seed}-{digest}.npz"
+    path = map_cache() / f'{Path(scene_name).stem}-{points}-{seed}-{digest}.npz'
     if not path.is_file():
-        prior = sample_mesh(scene.vertices, scene.faces, count=points, seed=seed, source=str(scene_name))
-        partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
+        prior = sample_mesh(
+            scene.vertices, scene.faces, count=points, seed=seed, source=str(scene_name)
+        )
+        partial = path.with_name(f'{path.stem}.{os.getpid()}.npz')
         prior.save(partial)
         partial.replace(path)  # atomic: another process sees all of it or nothing
     return path
@@ -137,12 +179,18 @@ def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int =
 
 def map_cache() -> Path:
     """`$XDG_CACHE_HOME/continuum_loc/maps`, by default under `~/.cache`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "continuum_loc" / "maps"
+    return (
+        Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'continuum_loc' / 'maps'
+    )
 
 
 def topic_of(sample: Measurement | TruthSample) -> str:
     """The topic of the contract that carries this sample."""
-    return f"tracker/{sample.sensor}" if isinstance(sample, TrackedPose) else TOPICS[type(sample).__name__]
+    return (
+        f'tracker/{sample.sensor}'
+        if isinstance(sample, TrackedPose)
+        else TOPICS[type(sample).__name__]
+    )
 
 
 def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[str, int]:
@@ -160,7 +208,15 @@ def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[
 
 def configuration(trial: Trial, **more: Any) -> dict[str, Any]:
     """Everything that a trial was made from, for its run folder; `more` adds to it."""
-    return {"robot": load_robot(trial.robot), "scene": trial.scene, "trajectory": trial.trajectory,
-            "map": {"scene": trial.map_scene or trial.scene, "points": MAP_POINTS}, "profile": trial.profile,
-            "tof_fidelity": trial.fidelity, "disturbed": trial.disturbed, "seed": trial.seed,
-            "duration": trial.duration, **more}
+    return {
+        'robot': load_robot(trial.robot),
+        'scene': trial.scene,
+        'trajectory': trial.trajectory,
+        'map': {'scene': trial.map_scene or trial.scene, 'points': MAP_POINTS},
+        'profile': trial.profile,
+        'tof_fidelity': trial.fidelity,
+        'disturbed': trial.disturbed,
+        'seed': trial.seed,
+        'duration': trial.duration,
+        **more,
+    }

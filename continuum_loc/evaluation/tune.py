@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import math
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.evaluation.campaign import parallel
@@ -18,11 +16,21 @@ from continuum_loc.evaluation.trials import make_filter
 from continuum_loc.mapping.prior_map import load_map
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
+import numpy as np
 
-PARAMETERS = ("prior.velocity", "prior.strain_rate", "prior.strain", "prior.velocity_slope", "tof.floor", "tof.cauchy",
-              "gyro.scale", "strain.scale")
+PARAMETERS = (
+    'prior.velocity',
+    'prior.strain_rate',
+    'prior.strain',
+    'prior.velocity_slope',
+    'tof.floor',
+    'tof.cauchy',
+    'gyro.scale',
+    'strain.scale',
+)
 FACTORS = (0.33, 0.6, 1.7, 3.0)
-# Error counts by its relative change; a NEES wrong by a factor of e costs as much as 20 % more error.
+# Error counts by its relative change; a NEES wrong by a factor of e costs as much as 20 % more
+# error.
 CONSISTENCY_WEIGHT = 0.2
 
 
@@ -42,21 +50,34 @@ class Trying:
     cost: float
 
 
-def tune(bag: Path, robot: RobotDescription, map_file: Path, start: EstimatorSettings, jobs: int = 1,
-         parameters: tuple[str, ...] = PARAMETERS,
-         tell: Callable[[Trying], None] = lambda tried: None) -> tuple[EstimatorSettings, list[Trying]]:
-    """Sweep each of `parameters` in turn over FACTORS times its value and keep what costs least.
-
-    Returns the settings found and all that was tried, the start first. `tell` is called after each.
+def tune(
+    bag: Path,
+    robot: RobotDescription,
+    map_file: Path,
+    start: EstimatorSettings,
+    jobs: int = 1,
+    parameters: tuple[str, ...] = PARAMETERS,
+    tell: Callable[[Trying], None] = lambda tried: None,
+) -> tuple[EstimatorSettings, list[Trying]]:
     """
-    first = attempt(bag, robot, map_file, start, "start", 1.0)
+    Sweep each of `parameters` in turn over FACTORS times its value and keep what costs least.
+
+    Returns the settings found and all that was tried, the start first. `tell` is called after
+    each.
+    """
+    first = attempt(bag, robot, map_file, start, 'start', 1.0)
     if not math.isfinite(first.cost):
-        raise TuneError(f"{bag}: no error can be told from it; a tuning bag holds `ground_truth/poses`")
+        raise TuneError(
+            f'{bag}: no error can be told from it; a tuning bag holds `ground_truth/poses`'
+        )
     tell(first)
     best, best_cost, tried = start, first.cost, [first]
     for name in parameters:
         candidates = {factor: scaled(best, name, factor) for factor in FACTORS}
-        work = [(bag, robot, map_file, settings, name, factor) for factor, settings in candidates.items()]
+        work = [
+            (bag, robot, map_file, settings, name, factor)
+            for factor, settings in candidates.items()
+        ]
         for one in parallel(attempt, work, jobs):
             tell(one)
             tried.append(one)
@@ -65,12 +86,20 @@ def tune(bag: Path, robot: RobotDescription, map_file: Path, start: EstimatorSet
     return best, tried
 
 
-def attempt(bag: Path, robot: RobotDescription, map_file: Path, settings: EstimatorSettings, parameter: str,
-            factor: float) -> Trying:
+def attempt(
+    bag: Path,
+    robot: RobotDescription,
+    map_file: Path,
+    settings: EstimatorSettings,
+    parameter: str,
+    factor: float,
+) -> Trying:
     """Replay the bag with these settings."""
     summary = summary_of(replay(bag, make_filter(robot, load_map(map_file), settings)))
-    error = (summary["translation_rmse_m"], summary["rotation_rmse_deg"])
-    return Trying(parameter, factor, *error, summary["nees_per_dof"], cost(*error, summary["nees_per_dof"]))
+    error = (summary['translation_rmse_m'], summary['rotation_rmse_deg'])
+    return Trying(
+        parameter, factor, *error, summary['nees_per_dof'], cost(*error, summary['nees_per_dof'])
+    )
 
 
 def cost(translation_m: float, rotation_deg: float, nees_per_dof: float) -> float:
@@ -83,23 +112,29 @@ def cost(translation_m: float, rotation_deg: float, nees_per_dof: float) -> floa
 
 
 def scaled(settings: EstimatorSettings, name: str, factor: float) -> EstimatorSettings:
-    """`settings` with the number (or tuple of numbers) at the dotted `name` times `factor`. Raises SettingsError where
-    the result is out of range, TuneError for a name that is none."""
+    """
+    `settings` with the number (or tuple of numbers) at the dotted `name` times `factor`. Raises
+    SettingsError where the result is out of range, TuneError for a name that is none.
+    """
     data: dict[str, Any] = settings.model_dump()
     group = data
-    *path, last = name.split(".")
+    *path, last = name.split('.')
     for part in path:
         group = group.get(part, {})
     if last not in group:
-        raise TuneError(f"no setting '{name}'; numbers that can be swept: {', '.join(sorted(_numbers(data)))}")
+        raise TuneError(
+            f"no setting '{name}'; numbers that can be swept: {', '.join(sorted(_numbers(data)))}"
+        )
     value = group[last]
-    group[last] = tuple(factor * item for item in value) if isinstance(value, tuple) else factor * value
-    return parse_settings(EstimatorSettings, data, where=f"{name} x {factor:g}")
+    group[last] = (
+        tuple(factor * item for item in value) if isinstance(value, tuple) else factor * value
+    )
+    return parse_settings(EstimatorSettings, data, where=f'{name} x {factor:g}')
 
 
-def _numbers(data: dict[str, Any], prefix: str = "") -> Iterator[str]:
+def _numbers(data: dict[str, Any], prefix: str = '') -> Iterator[str]:
     for name, value in data.items():
         if isinstance(value, dict):
-            yield from _numbers(value, f"{prefix}{name}.")
+            yield from _numbers(value, f'{prefix}{name}.')
         elif isinstance(value, (float, tuple)):
             yield prefix + name

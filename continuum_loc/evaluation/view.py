@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from continuum_loc.evaluation.replay import Cloud, ReplayResult
 from continuum_loc.evaluation.tracks import Track
 from continuum_loc.measurements import NANOSECONDS
+import numpy as np
 
 POINTS_PER_SPAN = 9
-CLOUD_SPAN = NANOSECONDS // 2  # a picture shows the ToF points of the half second before its instant
+CLOUD_SPAN = (
+    NANOSECONDS // 2
+)  # a picture shows the ToF points of the half second before its instant
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +26,10 @@ class Surroundings:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The body at one instant: estimated and true backbone (B, 3), estimated rings (R, 3), recent ToF points (M, 3).
-    `truth` is empty where none was recorded."""
+    """
+    The body at one instant: estimated and true backbone (B, 3), estimated rings (R, 3), recent ToF
+    points (M, 3). `truth` is empty where none was recorded.
+    """
 
     stamp: int
     backbone: np.ndarray
@@ -35,10 +38,13 @@ class Moment:
     points: np.ndarray
 
 
-def moments(result: ReplayResult, count: int, points: int, reach: float,
-            extra: np.ndarray | None = None) -> list[Moment]:
-    """At most `count` evenly spaced instants of the run and those in `extra` (stamps), each with at most `points`
-    ToF points of those in the `swept_box`."""
+def moments(
+    result: ReplayResult, count: int, points: int, reach: float, extra: np.ndarray | None = None
+) -> list[Moment]:
+    """
+    At most `count` evenly spaced instants of the run and those in `extra` (stamps), each with at
+    most `points` ToF points of those in the `swept_box`.
+    """
     track = result.track
     if len(track) == 0:
         return []
@@ -49,9 +55,16 @@ def moments(result: ReplayResult, count: int, points: int, reach: float,
     if extra is not None:
         chosen = np.union1d(chosen, np.searchsorted(track.stamps, extra).clip(0, len(track) - 1))
     estimated = track.backbone if track.backbone is not None else smooth_backbone(track.T_map_ring)
-    return [Moment(int(track.stamps[k]), estimated[k], true_backbone(result.truth, int(track.stamps[k])),
-                   track.T_map_ring[k, 1:, :3, 3], recent_points(cloud, int(track.stamps[k]), points))
-            for k in chosen]
+    return [
+        Moment(
+            int(track.stamps[k]),
+            estimated[k],
+            true_backbone(result.truth, int(track.stamps[k])),
+            track.T_map_ring[k, 1:, :3, 3],
+            recent_points(cloud, int(track.stamps[k]), points),
+        )
+        for k in chosen
+    ]
 
 
 def swept_box(result: ReplayResult, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -81,15 +94,27 @@ def smooth_backbone(T_map_ring: np.ndarray) -> np.ndarray:
     start, end = T_map_ring[:, :-1, None, :3], T_map_ring[:, 1:, None, :3]
     chord = np.linalg.norm(end[..., 3] - start[..., 3], axis=-1, keepdims=True)
     u = np.linspace(0.0, 1.0, POINTS_PER_SPAN)[None, None, :, None]
-    curve = ((1 + 2 * u) * (1 - u) ** 2 * start[..., 3] + u * (1 - u) ** 2 * chord * start[..., 0]
-             + u**2 * (3 - 2 * u) * end[..., 3] - u**2 * (1 - u) * chord * end[..., 0])
+    curve = (
+        (1 + 2 * u) * (1 - u) ** 2 * start[..., 3]
+        + u * (1 - u) ** 2 * chord * start[..., 0]
+        + u**2 * (3 - 2 * u) * end[..., 3]
+        - u**2 * (1 - u) * chord * end[..., 0]
+    )
     return curve.reshape(len(curve), -1, 3)
 
 
-def surroundings(result: ReplayResult, mesh: tuple[np.ndarray, np.ndarray] | None, map_points: np.ndarray | None,
-                 reach: float, most_faces: int, most_points: int) -> Surroundings:
-    """The part of the scene's mesh (vertices, faces) and of the prior map in the `swept_box`, thinned to the given
-    numbers."""
+def surroundings(
+    result: ReplayResult,
+    mesh: tuple[np.ndarray, np.ndarray] | None,
+    map_points: np.ndarray | None,
+    reach: float,
+    most_faces: int,
+    most_points: int,
+) -> Surroundings:
+    """
+    The part of the scene's mesh (vertices, faces) and of the prior map in the `swept_box`, thinned
+    to the given numbers.
+    """
     low, high = swept_box(result, reach)
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), int)
     if mesh is not None:
@@ -99,8 +124,9 @@ def surroundings(result: ReplayResult, mesh: tuple[np.ndarray, np.ndarray] | Non
     return Surroundings(vertices, faces, points[:: max(1, -(-len(points) // most_points))])
 
 
-def clipped(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray,
-            high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def clipped(
+    vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The mesh inside an axis-aligned box, its faces cut at the box's sides."""
     from trimesh.intersections import slice_faces_plane
 
@@ -112,12 +138,15 @@ def clipped(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray,
     return vertices, faces
 
 
-def thinned(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
+def thinned(
+    vertices: np.ndarray, faces: np.ndarray, most_faces: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with at most about `most_faces` faces, by quadric decimation."""
     import open3d as o3d
 
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices),
-                                     o3d.utility.Vector3iVector(faces.astype(np.int32)))
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces.astype(np.int32))
+    )
     mesh.remove_duplicated_vertices()
     if len(faces) > most_faces:
         mesh = mesh.simplify_quadric_decimation(most_faces)

@@ -1,14 +1,19 @@
-"""What differs between the prior map and what was measured: new things, and missing ones (paper, VI-C.4, eq. 12).
+"""
+What differs between the prior map and what was measured: new things, and missing ones (paper,
+VI-C.4, eq. 12).
 
-A *new* point is one whose squared Mahalanobis distance to the nearest map point exceeds tau. A map point stands for
-the surface around it, so Sigma_nn is flat: the map's sigma along the normal, and across it the scatter of the samples
-themselves. A blue-noise cell of mean area A has a mean square radius A / (2 pi), half of that along each tangent.
+A *new* point is one whose squared Mahalanobis distance to the nearest map point exceeds tau. A map
+point stands for
+the surface around it, so Sigma_nn is flat: the map's sigma along the normal, and across it the
+scatter of the samples themselves. A blue-noise cell of mean area A has a mean square radius A / (2
+pi), half of that along each tangent.
 
-A *missing* surface is one that a beam went through: the map, taken as discs, is crossed clearly before the measured
-end. Either kind also has its witnesses to the contrary (points that fit the map; beams that end on it), so that the
-evidence at a place is a share: how many of the beams that could tell disagree with the map. Places where most of
-them do are joined to clusters; the confidence of a cluster is the lower bound of that share (Wilson's), which grows
-with the number of beams and falls with every one that agrees.
+A *missing* surface is one that a beam went through: the map, taken as discs, is crossed clearly
+before the measured end. Either kind also has its witnesses to the contrary (points that fit the
+map; beams that end on it), so that the
+evidence at a place is a share: how many of the beams that could tell disagree with the map. Places
+where most of them do are joined to clusters; the confidence of a cluster is the lower bound of
+that share (Wilson's), which grows with the number of beams and falls with every one that agrees.
 """
 
 from __future__ import annotations
@@ -17,42 +22,66 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-import numpy as np
-from pydantic import Field
-
 from continuum_loc.mapping.build import DENSITY
 from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.reconstruct import Reconstruction, distances_to_mesh
+from continuum_loc.mapping.reconstruct import distances_to_mesh, Reconstruction
 from continuum_loc.mapping.splat_cast import first_crossings
 from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.settings import Settings
+import numpy as np
+from pydantic import Field
 
-Kind = Literal["added", "missing"]
+Kind = Literal['added', 'missing']
 
 
 class AnomalySettings(Settings):
     """Thresholds of the detector."""
 
-    tau: float = Field(16.3, gt=0.0, description="squared Mahalanobis distance of a new point (chi2, 3 dof, 0.1 %)")
-    min_distance: float = Field(0.01, ge=0.0, description="nothing closer to the map than this is new or missing [m]")
-    search_radius: float = Field(0.3, gt=0.0, description="a point with no map within this is new outright [m]")
-    cell: float = Field(0.015, gt=0.0, description="edge of the cells in which evidence is gathered [m]")
-    min_share: float = Field(0.5, gt=0.0, le=1.0, description="share of disagreeing beams that makes a cell suspect")
-    min_beams: int = Field(6, ge=1, description="disagreeing beams that a cluster needs")
-    min_size: float = Field(0.02, ge=0.0, description="extent that a cluster needs [m]: map edges fray by less")
-    disc: float = Field(0.6, gt=0.0, description="radius of the map's discs, in spacings; larger ones overhang edges")
-    min_frames: int = Field(2, ge=1, description="different instants that they must come from")
-    link: float = Field(0.03, gt=0.0, description="cells closer than this belong to one cluster [m]")
-    confidence_z: float = Field(1.64, gt=0.0, description="standard deviations of the confidence's lower bound")
+    tau: float = Field(
+        16.3,
+        gt=0.0,
+        description='squared Mahalanobis distance of a new point (chi2, 3 dof, 0.1 %)',
+    )
+    min_distance: float = Field(
+        0.01, ge=0.0, description='nothing closer to the map than this is new or missing [m]'
+    )
+    search_radius: float = Field(
+        0.3, gt=0.0, description='a point with no map within this is new outright [m]'
+    )
+    cell: float = Field(
+        0.015, gt=0.0, description='edge of the cells in which evidence is gathered [m]'
+    )
+    min_share: float = Field(
+        0.5, gt=0.0, le=1.0, description='share of disagreeing beams that makes a cell suspect'
+    )
+    min_beams: int = Field(6, ge=1, description='disagreeing beams that a cluster needs')
+    min_size: float = Field(
+        0.02, ge=0.0, description='extent that a cluster needs [m]: map edges fray by less'
+    )
+    disc: float = Field(
+        0.6,
+        gt=0.0,
+        description="radius of the map's discs, in spacings; larger ones overhang edges",
+    )
+    min_frames: int = Field(2, ge=1, description='different instants that they must come from')
+    link: float = Field(
+        0.03, gt=0.0, description='cells closer than this belong to one cluster [m]'
+    )
+    confidence_z: float = Field(
+        1.64, gt=0.0, description="standard deviations of the confidence's lower bound"
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class AnomalyCluster:
-    """One difference: `added` to the scene or `missing` from it.
+    """
+    One difference: `added` to the scene or `missing` from it.
 
-    points: (K, 3) [m] measured points (added) or map points passed through (missing); centre: (3,) their mean;
-    extent: (3,) edges of their bounding box [m]; beams: how many disagree; frames: from how many instants;
+    points: (K, 3) [m] measured points (added) or map points passed through (missing); centre: (3,)
+    their mean;
+    extent: (3,) edges of their bounding box [m]; beams: how many disagree; frames: from how many
+    instants;
     confidence: lower bound of the share of beams there that disagree with the map, 0..1.
     """
 
@@ -78,22 +107,35 @@ class Evidence(NamedTuple):
     stamps: np.ndarray
 
 
-def detect_anomalies(reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings | None = None,
-                     index: VoxelIndex | None = None) -> list[AnomalyCluster]:
+def detect_anomalies(
+    reconstruction: Reconstruction,
+    prior: PriorMap,
+    settings: AnomalySettings | None = None,
+    index: VoxelIndex | None = None,
+) -> list[AnomalyCluster]:
     """All differences of both kinds, most confident first. `index`: of `prior`, if there is one already."""
     settings = settings or AnomalySettings()
     index = index or prior.index(reach=0.05)
     gone, through = missing_evidence(reconstruction, prior, settings, index)
-    missing = clusters(gone, "missing", settings)
-    added = clusters(new_evidence(reconstruction, prior, settings, index, through), "added", settings)
+    missing = clusters(gone, 'missing', settings)
+    added = clusters(
+        new_evidence(reconstruction, prior, settings, index, through), 'added', settings
+    )
     return sorted(added + missing, key=lambda cluster: -cluster.confidence)
 
 
-def new_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings,
-                 index: VoxelIndex, through: np.ndarray | None = None) -> Evidence:
-    """Every measured point: does it lie off the map (eq. 12)?
+def new_evidence(
+    reconstruction: Reconstruction,
+    prior: PriorMap,
+    settings: AnomalySettings,
+    index: VoxelIndex,
+    through: np.ndarray | None = None,
+) -> Evidence:
+    """
+    Every measured point: does it lie off the map (eq. 12)?
 
-    Not of a beam that went `through` (N,) the map: what a missing thing has laid open is no new thing.
+    Not of a beam that went `through` (N,) the map: what a missing thing has laid open is no new
+    thing.
     """
     distance2, offset = mahalanobis2(reconstruction, prior, settings.search_radius, index)
     disagrees = (distance2 > settings.tau) & (offset > settings.min_distance)
@@ -102,8 +144,9 @@ def new_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: Anom
     return Evidence(reconstruction.points, disagrees, reconstruction.stamps)
 
 
-def mahalanobis2(reconstruction: Reconstruction, prior: PriorMap, search_radius: float,
-                 index: VoxelIndex) -> tuple[np.ndarray, np.ndarray]:
+def mahalanobis2(
+    reconstruction: Reconstruction, prior: PriorMap, search_radius: float, index: VoxelIndex
+) -> tuple[np.ndarray, np.ndarray]:
     """(N,) left side of eq. 12 and (N,) distance [m] to the nearest map point; inf where there is none."""
     row, distance = index.nearest(reconstruction.points, search_radius)
     distance2 = np.full(len(row), np.inf)
@@ -113,7 +156,9 @@ def mahalanobis2(reconstruction: Reconstruction, prior: PriorMap, search_radius:
     tangential = tangential_variance(prior)
     covariance = reconstruction.covariance[found] + (prior.sigma**2 + tangential) * np.eye(3)
     covariance -= tangential * normal[:, :, None] * normal[:, None, :]
-    distance2[found] = np.einsum("ni,ni->n", offset, np.linalg.solve(covariance, offset[:, :, None])[:, :, 0])
+    distance2[found] = np.einsum(
+        'ni,ni->n', offset, np.linalg.solve(covariance, offset[:, :, None])[:, :, 0]
+    )
     return distance2, distance
 
 
@@ -122,12 +167,15 @@ def tangential_variance(prior: PriorMap) -> float:
     return prior.spacing**2 / DENSITY / (4.0 * np.pi)
 
 
-def missing_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings,
-                     index: VoxelIndex) -> tuple[Evidence, np.ndarray]:
-    """Every mapped surface that a beam should have met first: did the beam go through it, or end on it? And for each
-    measured point (N,), whether its beam did go through.
+def missing_evidence(
+    reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings, index: VoxelIndex
+) -> tuple[Evidence, np.ndarray]:
+    """
+    Every mapped surface that a beam should have met first: did the beam go through it, or end on
+    it? And for each measured point (N,), whether its beam did go through.
 
-    A beam that ends in front of the mapped surface says nothing about it. One without a return went its whole length.
+    A beam that ends in front of the mapped surface says nothing about it. One without a return
+    went its whole length.
     """
     r = reconstruction
     origins = np.concatenate([r.origins, r.open_origins])
@@ -136,10 +184,11 @@ def missing_evidence(reconstruction: Reconstruction, prior: PriorMap, settings: 
     directions = beams / np.maximum(length, 1e-12)[:, None]
     sigma = np.zeros(len(beams))
     hit = directions[: len(r.points)]
-    sigma[: len(hit)] = np.sqrt(np.einsum("ni,nij,nj->n", hit, r.covariance, hit))
+    sigma[: len(hit)] = np.sqrt(np.einsum('ni,nij,nj->n', hit, r.covariance, hit))
     margin = np.maximum(np.sqrt(settings.tau * (sigma**2 + prior.sigma**2)), settings.min_distance)
-    row, depth = first_crossings(prior, index, origins, directions, length + margin,
-                                 radius=settings.disc * prior.spacing)
+    row, depth = first_crossings(
+        prior, index, origins, directions, length + margin, radius=settings.disc * prior.spacing
+    )
     met, through = row >= 0, length - depth > margin
     stamps = np.concatenate([r.stamps, np.arange(len(r.open_origins))])
     return Evidence(prior.points[row[met]], through[met], stamps[met]), through[: len(r.points)]
@@ -149,7 +198,9 @@ def clusters(evidence: Evidence, kind: Kind, settings: AnomalySettings) -> list[
     """Join the cells in which most beams disagree with the map."""
     if not evidence.disagrees.any():
         return []
-    cells, cell_of = np.unique(np.floor(evidence.places / settings.cell).astype(np.int64), axis=0, return_inverse=True)
+    cells, cell_of = np.unique(
+        np.floor(evidence.places / settings.cell).astype(np.int64), axis=0, return_inverse=True
+    )
     cell_of = cell_of.ravel()
     total = np.bincount(cell_of, minlength=len(cells))
     against = np.bincount(cell_of, weights=evidence.disagrees, minlength=len(cells))
@@ -157,8 +208,10 @@ def clusters(evidence: Evidence, kind: Kind, settings: AnomalySettings) -> list[
     suspect &= against > 0
     label = np.full(len(cells), -1)
     label[suspect] = _linked((cells[suspect] + 0.5) * settings.cell, settings.link)
-    found = (_cluster(evidence, np.flatnonzero(label[cell_of] == number), kind, settings)
-             for number in range(label.max() + 1))
+    found = (
+        _cluster(evidence, np.flatnonzero(label[cell_of] == number), kind, settings)
+        for number in range(label.max() + 1)
+    )
     return [cluster for cluster in found if cluster is not None]
 
 
@@ -168,12 +221,14 @@ def _linked(centres: np.ndarray, link: float) -> np.ndarray:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    pairs = cKDTree(centres).query_pairs(link, output_type="ndarray")
+    pairs = cKDTree(centres).query_pairs(link, output_type='ndarray')
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(centres),) * 2)
     return connected_components(graph, directed=False)[1]
 
 
-def _cluster(evidence: Evidence, members: np.ndarray, kind: Kind, settings: AnomalySettings) -> AnomalyCluster | None:
+def _cluster(
+    evidence: Evidence, members: np.ndarray, kind: Kind, settings: AnomalySettings
+) -> AnomalyCluster | None:
     against = members[evidence.disagrees[members]]
     frames = len(np.unique(evidence.stamps[against]))
     if len(against) < settings.min_beams or frames < settings.min_frames:
@@ -181,8 +236,15 @@ def _cluster(evidence: Evidence, members: np.ndarray, kind: Kind, settings: Anom
     points = evidence.places[against]
     if np.ptp(points, axis=0).max() < settings.min_size:
         return None
-    return AnomalyCluster(kind, points, points.mean(axis=0), np.ptp(points, axis=0), len(against), frames,
-                          wilson_lower_bound(len(against), len(members), settings.confidence_z))
+    return AnomalyCluster(
+        kind,
+        points,
+        points.mean(axis=0),
+        np.ptp(points, axis=0),
+        len(against),
+        frames,
+        wilson_lower_bound(len(against), len(members), settings.confidence_z),
+    )
 
 
 def wilson_lower_bound(successes: int, trials: int, z: float) -> float:
@@ -207,8 +269,11 @@ class Truth(NamedTuple):
 
 @dataclass(frozen=True)
 class PrecisionRecall:
-    """One row per confidence threshold: clusters kept, how many of them are real, real anomalies found, and both
-    as shares (precision is 1 where nothing is kept, recall 1 where there was nothing to find)."""
+    """
+    One row per confidence threshold: clusters kept, how many of them are real, real anomalies
+    found, and both as shares (precision is 1 where nothing is kept, recall 1 where there was
+    nothing to find).
+    """
 
     threshold: np.ndarray
     kept: np.ndarray
@@ -225,20 +290,32 @@ class PrecisionRecall:
         return self.found / self.truths if self.truths else np.ones(len(self.threshold))
 
 
-def precision_recall(detected: Sequence[AnomalyCluster], truth: Sequence[Truth], thresholds: np.ndarray,
-                     margin: float = 0.02) -> PrecisionRecall:
-    """Precision and recall of the clusters with at least each confidence threshold.
+def precision_recall(
+    detected: Sequence[AnomalyCluster],
+    truth: Sequence[Truth],
+    thresholds: np.ndarray,
+    margin: float = 0.02,
+) -> PrecisionRecall:
+    """
+    Precision and recall of the clusters with at least each confidence threshold.
 
-    A cluster is right when it is of the same kind as a true anomaly and most of its points lie within `margin` [m]
-    of that one's surface. A true anomaly is found by one such cluster; several clusters on it are all right.
+    A cluster is right when it is of the same kind as a true anomaly and most of its points lie
+    within `margin` [m] of that one's surface. A true anomaly is found by one such cluster; several
+    clusters on it are all right.
     """
     thresholds = np.asarray(thresholds, dtype=np.float64)
-    match = np.array([[_matches(cluster, one, margin) for one in truth] for cluster in detected], bool)
+    match = np.array(
+        [[_matches(cluster, one, margin) for one in truth] for cluster in detected], bool
+    )
     match = match.reshape(len(detected), len(truth))
     kept = np.array([cluster.confidence for cluster in detected])[None, :] >= thresholds[:, None]
     return PrecisionRecall(
-        threshold=thresholds, kept=kept.sum(axis=1), correct=(kept & match.any(axis=1)).sum(axis=1),
-        found=(kept[:, :, None] & match[None]).any(axis=1).sum(axis=1), truths=len(truth))
+        threshold=thresholds,
+        kept=kept.sum(axis=1),
+        correct=(kept & match.any(axis=1)).sum(axis=1),
+        found=(kept[:, :, None] & match[None]).any(axis=1).sum(axis=1),
+        truths=len(truth),
+    )
 
 
 def _matches(cluster: AnomalyCluster, truth: Truth, margin: float) -> bool:
@@ -254,8 +331,12 @@ def _near_solid(points: np.ndarray, truth: Truth, margin: float) -> np.ndarray:
     return near
 
 
-def seen(truth: Sequence[Truth], reconstruction: Reconstruction, least_beams: int = 10) -> list[Truth]:
-    """Those of the true anomalies that at least so many beams ended on (added) or went through (missing).
+def seen(
+    truth: Sequence[Truth], reconstruction: Reconstruction, least_beams: int = 10
+) -> list[Truth]:
+    """
+    Those of the true anomalies that at least so many beams ended on (added) or went through
+    (missing).
 
     Needs a reconstruction from the true poses: it says what could have been detected.
     """
@@ -263,14 +344,23 @@ def seen(truth: Sequence[Truth], reconstruction: Reconstruction, least_beams: in
 
 
 def _beams_on(truth: Truth, reconstruction: Reconstruction) -> int:
-    if truth.kind == "added":
+    if truth.kind == 'added':
         return int(_near_solid(reconstruction.points, truth, 0.01).sum())
-    if truth.kind != "missing":
+    if truth.kind != 'missing':
         raise MapError(f"an anomaly is added or missing, not '{truth.kind}'")
     import open3d
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(np.asarray(truth.vertices, np.float32), np.asarray(truth.faces, np.uint32))
-    rays = np.concatenate([reconstruction.origins, reconstruction.points - reconstruction.origins], axis=1)
-    depth = scene.cast_rays(rays.astype(np.float32), nthreads=1)["t_hit"].numpy()  # in units of the beam's length
-    return int((depth * np.linalg.norm(rays[:, 3:], axis=1) < np.linalg.norm(rays[:, 3:], axis=1) - 0.02).sum())
+    rays = np.concatenate(
+        [reconstruction.origins, reconstruction.points - reconstruction.origins], axis=1
+    )
+    depth = scene.cast_rays(rays.astype(np.float32), nthreads=1)[
+        't_hit'
+    ].numpy()  # in units of the beam's length
+    return int(
+        (
+            depth * np.linalg.norm(rays[:, 3:], axis=1)
+            < np.linalg.norm(rays[:, 3:], axis=1) - 0.02
+        ).sum()
+    )

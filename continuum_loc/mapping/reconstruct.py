@@ -7,25 +7,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.ply import write_ply
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from continuum_loc.robot import RobotDescription
+from numba import njit
+import numpy as np
 
 CHUNK = 50_000  # points whose covariances are computed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class RingTrajectory:
-    """Poses of the base and R rings over time.
+    """
+    Poses of the base and R rings over time.
 
-    stamps: (N,) ns, rising. T_map_ring: (N, R + 1, 4, 4), the base first. covariance: (N, R + 1, 6, 6) of a right
-    perturbation, [rho; phi] order, or None for known poses.
+    stamps: (N,) ns, rising. T_map_ring: (N, R + 1, 4, 4), the base first. covariance: (N, R + 1,
+    6, 6) of a right perturbation, [rho; phi] order, or None for known poses.
     """
 
     stamps: np.ndarray
@@ -35,44 +35,60 @@ class RingTrajectory:
     def __post_init__(self):
         count = len(self.stamps)
         if count == 0 or self.T_map_ring.shape[0] != count or self.T_map_ring.shape[2:] != (4, 4):
-            raise MapError(f"a trajectory needs stamps (N,) and T_map_ring (N, R + 1, 4, 4) with N >= 1, got "
-                           f"{np.shape(self.stamps)} and {self.T_map_ring.shape}")
+            raise MapError(
+                f'a trajectory needs stamps (N,) and T_map_ring (N, R + 1, 4, 4) with N >= 1, got '
+                f'{np.shape(self.stamps)} and {self.T_map_ring.shape}'
+            )
         if np.any(np.diff(self.stamps) <= 0):
             row = int(np.argmax(np.diff(self.stamps) <= 0)) + 1
-            raise MapError(f"stamps of a trajectory must rise; number {row} does not")
+            raise MapError(f'stamps of a trajectory must rise; number {row} does not')
 
     @classmethod
     def of_estimates(cls, estimates: Iterable[Estimate]) -> RingTrajectory:
         """From estimates in order of time; pass the `lagged` ones for the smoothed trajectory."""
         estimates = list(estimates)
         if not estimates:
-            raise MapError("no estimates to make a trajectory of")
-        return cls(np.array([e.stamp for e in estimates], np.int64), np.stack([e.T_map_ring for e in estimates]),
-                   np.stack([e.covariance for e in estimates]))
+            raise MapError('no estimates to make a trajectory of')
+        return cls(
+            np.array([e.stamp for e in estimates], np.int64),
+            np.stack([e.T_map_ring for e in estimates]),
+            np.stack([e.covariance for e in estimates]),
+        )
 
     def at(self, stamps: np.ndarray, rings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """T_map_ring (M, 4, 4) and covariance (M, 6, 6) of ring number `rings` (M,) at `stamps` (M,) within the
-        trajectory: along the geodesic between samples, the covariance linear in time."""
+        """
+        T_map_ring (M, 4, 4) and covariance (M, 6, 6) of ring number `rings` (M,) at `stamps` (M,)
+        within the
+        trajectory: along the geodesic between samples, the covariance linear in time.
+        """
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, max(len(self.stamps) - 1, 1))
         before, after = after - 1, np.minimum(after, len(self.stamps) - 1)
         span = np.maximum(self.stamps[after] - self.stamps[before], 1)
         share = (stamps - self.stamps[before]) / span
-        T_map_ring = lie.interpolate(self.T_map_ring[before, rings], self.T_map_ring[after, rings], share)
+        T_map_ring = lie.interpolate(
+            self.T_map_ring[before, rings], self.T_map_ring[after, rings], share
+        )
         if self.covariance is None:
             return T_map_ring, np.zeros((len(stamps), 6, 6))
         share = share[:, None, None]
-        covariance = (1.0 - share) * self.covariance[before, rings] + share * self.covariance[after, rings]
+        covariance = (1.0 - share) * self.covariance[before, rings] + share * self.covariance[
+            after, rings
+        ]
         return T_map_ring, covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """N measured surface points in `map`, and M beams that met nothing.
+    """
+    N measured surface points in `map`, and M beams that met nothing.
 
-    points, origins: (N, 3) [m], where the beam ended and began; covariance: (N, 3, 3) [m^2] of `points`.
+    points, origins: (N, 3) [m], where the beam ended and began; covariance: (N, 3, 3) [m^2] of
+    `points`.
     stamps: (N,) ns; sensors: names; sensor: (N,) number of the sensor in `sensors`.
-    open_origins, open_ends: (M, 3) [m] of beams without a return, ending at the sensor's greatest range.
-    skipped: frames that lay outside the trajectory's time; on_body: zones dropped because they saw the robot itself.
+    open_origins, open_ends: (M, 3) [m] of beams without a return, ending at the sensor's greatest
+    range.
+    skipped: frames that lay outside the trajectory's time; on_body: zones dropped because they saw
+    the robot itself.
     """
 
     points: np.ndarray
@@ -92,18 +108,24 @@ class Reconstruction:
         return np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3.0)
 
     def save(self, path: str | Path, anomaly: np.ndarray | None = None) -> None:
-        """Write a `.ply` with x, y, z, sigma, the covariance's upper triangle, seconds since the first point, the
-        sensor's number and, if given, `anomaly` (N,)."""
-        if Path(path).suffix.lower() != ".ply":
-            raise MapError(f"{path}: a reconstruction is written as .ply")
+        """
+        Write a `.ply` with x, y, z, sigma, the covariance's upper triangle, seconds since the
+        first point, the sensor's number and, if given, `anomaly` (N,).
+        """
+        if Path(path).suffix.lower() != '.ply':
+            raise MapError(f'{path}: a reconstruction is written as .ply')
         rows, columns = np.triu_indices(3)
-        names = ["cxx", "cxy", "cxz", "cyy", "cyz", "czz"]
-        fields = dict(zip("xyz", self.points.T, strict=True)) | {"sigma": self.sigma.astype(np.float32)}
-        fields |= dict(zip(names, self.covariance[:, rows, columns].T.astype(np.float32), strict=True))
+        names = ['cxx', 'cxy', 'cxz', 'cyy', 'cyz', 'czz']
+        fields = dict(zip('xyz', self.points.T, strict=True)) | {
+            'sigma': self.sigma.astype(np.float32)
+        }
+        fields |= dict(
+            zip(names, self.covariance[:, rows, columns].T.astype(np.float32), strict=True)
+        )
         first = self.stamps.min() if len(self.stamps) else 0
-        fields |= {"time": (self.stamps - first) * 1e-9, "sensor": self.sensor.astype(np.int32)}
+        fields |= {'time': (self.stamps - first) * 1e-9, 'sensor': self.sensor.astype(np.int32)}
         if anomaly is not None:
-            fields["anomaly"] = np.asarray(anomaly).astype(np.uint8)
+            fields['anomaly'] = np.asarray(anomaly).astype(np.uint8)
         write_ply(path, fields)
 
     def distances_to_mesh(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -111,43 +133,74 @@ class Reconstruction:
         return distances_to_mesh(self.points, vertices, faces)
 
 
-def reconstruct(robot: RobotDescription, frames: Sequence[TofFrame], trajectory: RingTrajectory, *,
-                floor: float = 0.001, beam_width_deg: float = 0.0, body_margin: float = 0.01) -> Reconstruction:
-    """Project every usable zone of `frames` into the map (eq. 10) with its covariance (eq. 11).
+def reconstruct(
+    robot: RobotDescription,
+    frames: Sequence[TofFrame],
+    trajectory: RingTrajectory,
+    *,
+    floor: float = 0.001,
+    beam_width_deg: float = 0.0,
+    body_margin: float = 0.01,
+) -> Reconstruction:
+    """
+    Project every usable zone of `frames` into the map (eq. 10) with its covariance (eq. 11).
 
-    The noise of a zone lies along its beam: the variance the sensor states for the range (Table I of the paper where
-    it states none), and across it that of a footprint of `beam_width_deg` (uniform; 0 for the paper's thin rays);
-    `floor` [m] is added in all directions for what is not modelled. A pose error delta = [rho; phi] of the ring moves
-    a point q of the ring's frame by R (rho + phi x q), so that its share is R [I, -q^] Sigma [I, -q^]^T R^T.
-    Zones within `body_margin` [m] of the robot's own surface are dropped and counted.
+    The noise of a zone lies along its beam: the variance the sensor states for the range (Table I
+    of the paper where it states none), and across it that of a footprint of `beam_width_deg`
+    (uniform; 0 for the paper's thin rays); `floor` [m] is added in all directions for what is not
+    modelled. A pose error delta = [rho; phi] of the ring moves a point q of the ring's frame by R
+    (rho + phi x q), so that its share is R [I, -q^] Sigma [I, -q^]^T R^T. Zones within
+    `body_margin` [m] of the robot's own surface are dropped and counted.
     """
     stack = _stacked(robot, frames, trajectory)
     T_ring_sensor = np.stack([sensor.mount.T_ring_sensor for sensor in robot.tof])[stack.sensor]
-    rings = np.array([robot.ring_names.index(sensor.ring) + 1 for sensor in robot.tof])[stack.sensor]
+    rings = np.array([robot.ring_names.index(sensor.ring) + 1 for sensor in robot.tof])[
+        stack.sensor
+    ]
     T_map_ring, pose_covariance = trajectory.at(stack.stamps, rings)
     T_map_sensor = T_map_ring @ T_ring_sensor
-    in_map = np.einsum("fij,fzj->fzi", T_map_sensor[:, :3, :3], stack.points) + T_map_sensor[:, None, :3, 3]
-    itself = stack.usable & _on_body(in_map, trajectory, stack.stamps, max(robot.radius + body_margin, 0.0))
+    in_map = (
+        np.einsum('fij,fzj->fzi', T_map_sensor[:, :3, :3], stack.points)
+        + T_map_sensor[:, None, :3, 3]
+    )
+    itself = stack.usable & _on_body(
+        in_map, trajectory, stack.stamps, max(robot.radius + body_margin, 0.0)
+    )
     frame_of, zone = np.nonzero(stack.usable & ~itself)
     covariance = np.empty((len(frame_of), 3, 3))
     for start in range(0, len(frame_of), CHUNK):
         part = slice(start, start + CHUNK)
         own = frame_of[part]
         covariance[part] = _point_covariance(
-            T_map_ring[own, :3, :3], pose_covariance[own], T_ring_sensor[own], stack.points[own, zone[part]],
-            stack.sigma[own, zone[part]], floor, np.radians(beam_width_deg))
+            T_map_ring[own, :3, :3],
+            pose_covariance[own],
+            T_ring_sensor[own],
+            stack.points[own, zone[part]],
+            stack.sigma[own, zone[part]],
+            floor,
+            np.radians(beam_width_deg),
+        )
     open_frame, open_zone = np.nonzero(np.isposinf(stack.ranges))
     open_ends = robot.tof_model.max_range * robot.tof_model.directions[open_zone]
     return Reconstruction(
-        points=in_map[frame_of, zone], covariance=covariance, origins=T_map_sensor[frame_of, :3, 3],
-        stamps=stack.stamps[frame_of], sensor=stack.sensor[frame_of], sensors=tuple(s.name for s in robot.tof),
-        open_origins=T_map_sensor[open_frame, :3, 3], open_ends=_transform(T_map_sensor[open_frame], open_ends),
-        skipped=stack.skipped, on_body=int(itself.sum()))
+        points=in_map[frame_of, zone],
+        covariance=covariance,
+        origins=T_map_sensor[frame_of, :3, 3],
+        stamps=stack.stamps[frame_of],
+        sensor=stack.sensor[frame_of],
+        sensors=tuple(s.name for s in robot.tof),
+        open_origins=T_map_sensor[open_frame, :3, 3],
+        open_ends=_transform(T_map_sensor[open_frame], open_ends),
+        skipped=stack.skipped,
+        on_body=int(itself.sum()),
+    )
 
 
 class _Stack(NamedTuple):
-    """F frames of Z zones as arrays: stamps (F,), number of the sensor (F,), points (F, Z, 3), ranges, sigma and
-    usable (F, Z); and how many frames lie outside the trajectory's time."""
+    """
+    F frames of Z zones as arrays: stamps (F,), number of the sensor (F,), points (F, Z, 3),
+    ranges, sigma and usable (F, Z); and how many frames lie outside the trajectory's time.
+    """
 
     stamps: np.ndarray
     sensor: np.ndarray
@@ -158,34 +211,49 @@ class _Stack(NamedTuple):
     skipped: int
 
 
-def _stacked(robot: RobotDescription, frames: Sequence[TofFrame], trajectory: RingTrajectory) -> _Stack:
+def _stacked(
+    robot: RobotDescription, frames: Sequence[TofFrame], trajectory: RingTrajectory
+) -> _Stack:
     first, last = trajectory.stamps[0], trajectory.stamps[-1]
     inside = [frame for frame in frames if first <= frame.stamp <= last]
     if not inside:
-        raise MapError(f"none of the {len(frames)} ToF frames lies within the trajectory's time, {first} to {last} ns")
+        raise MapError(
+            f"none of the {len(frames)} ToF frames lies within the trajectory's time, {first} to {last} ns"
+        )
     names = [sensor.name for sensor in robot.tof]
     strange = sorted({frame.sensor for frame in inside} - set(names))
     if strange:
-        raise MapError(f"frames of {', '.join(strange)}; robot '{robot.name}' has the ToF sensors {', '.join(names)}")
+        raise MapError(
+            f"frames of {', '.join(strange)}; robot '{robot.name}' has the ToF sensors {', '.join(names)}"
+        )
     zones = len(robot.tof_model.directions)
     for frame in inside:
         if frame.points.shape != (zones, 3) or frame.ranges.shape != (zones,):
-            raise MapError(f"a frame of {frame.sensor} has points {frame.points.shape}, the robot's ToF model {zones} "
-                           "zones")
-    ranges, sigma, status = (np.stack([getattr(frame, name) for frame in inside]) for name in
-                             ("ranges", "sigma", "status"))
+            raise MapError(
+                f"a frame of {frame.sensor} has points {frame.points.shape}, the robot's ToF model {zones} "
+                'zones'
+            )
+    ranges, sigma, status = (
+        np.stack([getattr(frame, name) for frame in inside])
+        for name in ('ranges', 'sigma', 'status')
+    )
     usable = np.isfinite(ranges) & np.isin(status, (TOF_VALID, *TOF_HALF_CONFIDENT))
     return _Stack(
         stamps=np.array([frame.stamp for frame in inside], np.int64),
         sensor=np.array([names.index(frame.sensor) for frame in inside]),
-        points=np.stack([frame.points for frame in inside]).astype(np.float64), ranges=ranges,
-        sigma=np.where(np.isfinite(sigma), sigma, robot.tof_model.sigma(ranges)), usable=usable,
-        skipped=len(frames) - len(inside))
+        points=np.stack([frame.points for frame in inside]).astype(np.float64),
+        ranges=ranges,
+        sigma=np.where(np.isfinite(sigma), sigma, robot.tof_model.sigma(ranges)),
+        usable=usable,
+        skipped=len(frames) - len(inside),
+    )
 
 
 def _on_body(points, trajectory, stamps, distance, samples=8):
-    """(F, Z) whether points (F, Z, 3) at `stamps` (F,) lie within `distance` of the backbone, which is drawn through
-    the base and the rings as a Hermite cubic (their x axes are its tangents)."""
+    """
+    (F, Z) whether points (F, Z, 3) at `stamps` (F,) lie within `distance` of the backbone, which
+    is drawn through the base and the rings as a Hermite cubic (their x axes are its tangents).
+    """
     nodes = trajectory.T_map_ring.shape[1]
     u = np.linspace(0.0, 1.0, samples, endpoint=False)[:, None]
     on = np.zeros(points.shape[:2], bool)
@@ -209,7 +277,10 @@ def _within(points, polyline, distance):
     for f in range(points.shape[0]):
         for z in range(points.shape[1]):
             for k in range(polyline.shape[1] - 1):
-                if _segment_distance2(points[f, z], polyline[f, k], polyline[f, k + 1]) < distance * distance:
+                if (
+                    _segment_distance2(points[f, z], polyline[f, k], polyline[f, k + 1])
+                    < distance * distance
+                ):
                     out[f, z] = True
                     break
     return out
@@ -229,16 +300,20 @@ def _segment_distance2(p, a, b):
 
 def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (N, 3) by transforms (N, 4, 4)."""
-    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+    return np.einsum('nij,nj->ni', T[:, :3, :3], points) + T[:, :3, 3]
 
 
-def _point_covariance(R_map_ring, pose_covariance, T_ring_sensor, q_sensor, sigma, floor, beam_width):
+def _point_covariance(
+    R_map_ring, pose_covariance, T_ring_sensor, q_sensor, sigma, floor, beam_width
+):
     """(N, 3, 3) covariance in the map: the pose's share by its Jacobian, the beam's in its own axes."""
     q_ring = _transform(T_ring_sensor, q_sensor)
-    jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(q_ring), 3, 3)), -lie.hat(q_ring)], axis=2)
+    jacobian = np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(q_ring), 3, 3)), -lie.hat(q_ring)], axis=2
+    )
     in_ring = jacobian @ pose_covariance @ jacobian.transpose(0, 2, 1)
     length = np.linalg.norm(q_sensor, axis=1)
-    beam = np.einsum("nij,nj->ni", T_ring_sensor[:, :3, :3], q_sensor / length[:, None])
+    beam = np.einsum('nij,nj->ni', T_ring_sensor[:, :3, :3], q_sensor / length[:, None])
     across = (length * beam_width) ** 2 / 12.0
     in_ring += (sigma**2 - across)[:, None, None] * beam[:, :, None] * beam[:, None, :]
     in_ring += (across + floor**2)[:, None, None] * np.eye(3)
@@ -251,7 +326,11 @@ def distances_to_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarra
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(np.asarray(vertices, np.float32), np.asarray(faces, np.uint32))
-    return scene.compute_distance(np.asarray(points, np.float32), nthreads=1).numpy().astype(np.float64)
+    return (
+        scene.compute_distance(np.asarray(points, np.float32), nthreads=1)
+        .numpy()
+        .astype(np.float64)
+    )
 
 
 def root_mean_square(distances: np.ndarray) -> float:

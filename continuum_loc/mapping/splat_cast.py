@@ -2,28 +2,47 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import BLOCK, BLOCK_VOXELS, VoxelIndex, _find_slot, _pack
+from continuum_loc.mapping.voxel_index import _find_slot, _pack, BLOCK, BLOCK_VOXELS, VoxelIndex
+from numba import njit
+import numpy as np
 
 COVER = 1.25  # spacings: 99.9 % of a sampled surface lies nearer than this to a sample
 
 
-def first_crossings(prior: PriorMap, index: VoxelIndex, origins: np.ndarray, directions: np.ndarray,
-                    lengths: np.ndarray, *, radius: float | None = None, min_cos: float = 0.2,
-                    ) -> tuple[np.ndarray, np.ndarray]:
-    """(rows (N,) of the map points first crossed, or -1; depths (N,) along the rays [m], or inf).
+def first_crossings(
+    prior: PriorMap,
+    index: VoxelIndex,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    lengths: np.ndarray,
+    *,
+    radius: float | None = None,
+    min_cos: float = 0.2,
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    (rows (N,) of the map points first crossed, or -1; depths (N,) along the rays [m], or inf).
 
-    origins (N, 3) [m]; directions (N, 3) unit; lengths (N,) how far to look [m]. radius: of the discs [m], by default
-    a little more than the map's spacing, at which blue-noise points leave hardly a hole. min_cos: discs more oblique
-    than this are passed by; on an oriented map so are those seen from inside the solid.
+    origins (N, 3) [m]; directions (N, 3) unit; lengths (N,) how far to look [m]. radius: of the
+    discs [m], by default a little more than the map's spacing, at which blue-noise points leave
+    hardly a hole. min_cos: discs more oblique than this are passed by; on an oriented map so are
+    those seen from inside the solid.
     """
     radius = COVER * prior.spacing if radius is None else radius
     rows, depths = np.full(len(origins), -1, np.int64), np.full(len(origins), np.inf)
-    rays = (np.ascontiguousarray(part, dtype=np.float64) for part in (origins, directions, lengths))
-    _cast(index.arrays, prior.normals, *rays, float(radius), float(min_cos), prior.oriented, rows, depths)
+    rays = (
+        np.ascontiguousarray(part, dtype=np.float64) for part in (origins, directions, lengths)
+    )
+    _cast(
+        index.arrays,
+        prior.normals,
+        *rays,
+        float(radius),
+        float(min_cos),
+        prior.oriented,
+        rows,
+        depths,
+    )
     return rows, depths
 
 
@@ -31,18 +50,28 @@ def first_crossings(prior: PriorMap, index: VoxelIndex, origins: np.ndarray, dir
 def _cast(arrays, normals, origins, directions, lengths, radius, min_cos, oriented, rows, depths):
     for ray in range(origins.shape[0]):
         rows[ray], depths[ray] = _first_crossing(
-            arrays, normals, origins[ray], directions[ray], lengths[ray], radius, min_cos, oriented)
+            arrays, normals, origins[ray], directions[ray], lengths[ray], radius, min_cos, oriented
+        )
 
 
 @njit(cache=True)
 def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos, oriented):
-    """March through the index's blocks (Amanatides and Woo, 1987) until the next one lies beyond the best crossing.
+    """
+    March through the index's blocks (Amanatides and Woo, 1987) until the next one lies beyond the
+    best crossing.
 
-    A disc is looked for in the block of its centre only. One that reaches from a neighbouring block, through which
-    the ray does not run, is not seen: a share of about radius / block edge of the surface has thinner cover.
+    A disc is looked for in the block of its centre only. One that reaches from a neighbouring
+    block, through which
+    the ray does not run, is not seen: a share of about radius / block edge of the surface has
+    thinner cover.
     """
     edge = arrays.voxel * BLOCK
-    at, step, until, stride = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
+    at, step, until, stride = (
+        np.empty(3, np.int64),
+        np.empty(3, np.int64),
+        np.empty(3),
+        np.empty(3),
+    )
     corner = (arrays.x0, arrays.y0, arrays.z0)
     extent = (arrays.blocks_x, arrays.blocks_y, arrays.blocks_z)
     for axis in range(3):
@@ -59,8 +88,18 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
             key = _pack(at[0], at[1], at[2])
             row = _find_slot(arrays.block_slots, key, arrays.block_slots.shape[0] - 1)
             if arrays.block_slots[row, 0] == key:
-                best, depth = _cross_block(arrays, arrays.block_slots[row, 1], normals, origin, direction, radius,
-                                           min_cos, oriented, best, depth)
+                best, depth = _cross_block(
+                    arrays,
+                    arrays.block_slots[row, 1],
+                    normals,
+                    origin,
+                    direction,
+                    radius,
+                    min_cos,
+                    oriented,
+                    best,
+                    depth,
+                )
         axis = int(np.argmin(until))
         entered = until[axis]
         until[axis] += stride[axis]
@@ -69,12 +108,20 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
 
 
 @njit(cache=True)
-def _cross_block(arrays, block, normals, origin, direction, radius, min_cos, oriented, best, depth):
+def _cross_block(
+    arrays, block, normals, origin, direction, radius, min_cos, oriented, best, depth
+):
     """Improve (row, depth) by the discs of one block."""
     points = arrays.points
-    for p in range(arrays.voxel_start[block * BLOCK_VOXELS], arrays.voxel_start[(block + 1) * BLOCK_VOXELS]):
+    for p in range(
+        arrays.voxel_start[block * BLOCK_VOXELS], arrays.voxel_start[(block + 1) * BLOCK_VOXELS]
+    ):
         row = int(points[p, 3])
-        toward = -(normals[row, 0] * direction[0] + normals[row, 1] * direction[1] + normals[row, 2] * direction[2])
+        toward = -(
+            normals[row, 0] * direction[0]
+            + normals[row, 1] * direction[1]
+            + normals[row, 2] * direction[2]
+        )
         if (toward if oriented else abs(toward)) < min_cos:
             continue
         ox, oy, oz = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 from pathlib import Path
+import sys
 from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from scipy.spatial.transform import Rotation
-from std_srvs.srv import Trigger
-
-from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter, settings_of
+from continuum_loc.estimator import EstimatorSettings, settings_of, SlidingWindowFilter
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.settings import PRESETS_FOLDER
-from continuum_loc.measurements import EncoderSample, Measurement, TofFrame, nanoseconds
+from continuum_loc.measurements import EncoderSample, Measurement, nanoseconds, TofFrame
 from continuum_loc.nodes import parameters
 from continuum_loc.nodes.memory import SeenScene, Trajectory
 from continuum_loc.nodes.runtime import run
@@ -24,22 +19,26 @@ from continuum_loc.nodes.transforms import broadcaster
 from continuum_loc.nodes.warm_up import warm_up
 from continuum_loc.nodes.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import columns_message, map_record, tip_message, tracked_pose
 from msg_tools.errors import ConvertError
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
-from msg_tools.topics import TRACKER, tip_of
+from msg_tools.topics import tip_of, TRACKER
+import numpy as np
+from scipy.spatial.transform import Rotation
+from std_srvs.srv import Trigger
 
-FILTER = "filter."
+FILTER = 'filter.'
 
 
 class EstimatorNode(WorkerNode):
     """The sliding-window filter on a graph."""
 
-    inputs = ("tof/points", "imu/data_raw", "imu/mag", "strain", "joint_states", TRACKER)
+    inputs = ('tof/points', 'imu/data_raw', 'imu/mag', 'strain', 'joint_states', TRACKER)
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("estimator", EstimatorNodeSettings(), **options)
+        super().__init__('estimator', EstimatorNodeSettings(), **options)
         self.filter_settings = parameters.declare(self, self._preset(), FILTER)
         self.check_parameters()
         self.prior_map = self._load_map()
@@ -53,8 +52,8 @@ class EstimatorNode(WorkerNode):
         self._offer_services()
         self.frames = broadcaster(self, self.robot, self.settings.frame_prefix)
         if self.frames is None:
-            self.get_logger().info("no TF: tf2_msgs is not installed")
-        for topic in ("poses", "backbone", "tip", "reconstruction"):
+            self.get_logger().info('no TF: tf2_msgs is not installed')
+        for topic in ('poses', 'backbone', 'tip', 'reconstruction'):
             self.publisher(topic)
         self._publish_map()
         self.begin()
@@ -65,8 +64,8 @@ class EstimatorNode(WorkerNode):
         """One measurement through the filter; publish the estimate when a step fell due."""
         if isinstance(measurement, TofFrame) and self.settings.reconstruction_seconds > 0.0:
             self.scene.see(measurement)
-        if isinstance(measurement, EncoderSample) and "insertion" in measurement.names:
-            self._insertion = float(measurement.position[measurement.names.index("insertion")])
+        if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
+            self._insertion = float(measurement.position[measurement.names.index('insertion')])
         estimate = self.filter.process(measurement)
         if estimate is None:
             return None
@@ -83,70 +82,94 @@ class EstimatorNode(WorkerNode):
         """Lost is an error; starting, unconverged steps and suspects are warnings."""
         estimate = self.estimate
         if estimate is None:
-            return WARN, "no estimate yet", {}
-        inliers = float(np.mean(list(estimate.inliers.values()))) if estimate.inliers else float("nan")
+            return WARN, 'no estimate yet', {}
+        inliers = (
+            float(np.mean(list(estimate.inliers.values()))) if estimate.inliers else float('nan')
+        )
         recent = self.step.recent(30)
-        values = {"status": estimate.status, "consistency": estimate.consistency, "inliers": inliers,
-                  "suspects": ", ".join(estimate.suspects) or "none", "iterations": estimate.iterations,
-                  "step mean [ms]": float(1e3 * recent.mean()) if len(recent) else float("nan"),
-                  "latency [ms]": float(1e3 * np.median(self.latency.recent(30))) if self.latency.values else "unknown",
-                  "rate [Hz]": _rate(self.trajectory)}
-        if estimate.status == "lost":
-            return ERROR, "lost", values
-        if estimate.status == "initialising":
-            return WARN, "initialising", values
+        values = {
+            'status': estimate.status,
+            'consistency': estimate.consistency,
+            'inliers': inliers,
+            'suspects': ', '.join(estimate.suspects) or 'none',
+            'iterations': estimate.iterations,
+            'step mean [ms]': float(1e3 * recent.mean()) if len(recent) else float('nan'),
+            'latency [ms]': float(1e3 * np.median(self.latency.recent(30)))
+            if self.latency.values
+            else 'unknown',
+            'rate [Hz]': _rate(self.trajectory),
+        }
+        if estimate.status == 'lost':
+            return ERROR, 'lost', values
+        if estimate.status == 'initialising':
+            return WARN, 'initialising', values
         if estimate.suspects:
-            return WARN, f"suspect: {', '.join(estimate.suspects)}", values
-        return (OK, "tracking", values) if estimate.converged else (WARN, "the last step did not converge", values)
+            return WARN, f'suspect: {", ".join(estimate.suspects)}', values
+        return (
+            (OK, 'tracking', values)
+            if estimate.converged
+            else (WARN, 'the last step did not converge', values)
+        )
 
     def summary(self) -> dict[str, Any]:
         """Adds the filter's own counts."""
-        return super().summary() | {"filter": self.filter.counts}
+        return super().summary() | {'filter': self.filter.counts}
 
     # ------------------------------------------------ outputs
 
     def _publish(self, estimate: Estimate) -> None:
         self.estimate = estimate
-        self.publish("poses", estimate)
+        self.publish('poses', estimate)
         child = self.settings.frame_prefix + self.robot.ring_names[-1]
-        self.publish_message("tip", tip_message(ros_messages(), tip_of(estimate), child))
-        self.publish("backbone", estimate)
+        self.publish_message('tip', tip_message(ros_messages(), tip_of(estimate), child))
+        self.publish('backbone', estimate)
         if self.frames is not None and self.settings.publish_tf:
             self.frames.send(estimate.stamp, estimate.T_map_ring)
         self.trajectory.add(estimate)
         self.scene.place(estimate, self.settings.reconstruction_seconds)
-        due = estimate.stamp - self._scene_published >= nanoseconds(1.0 / self.settings.reconstruction_rate)
-        if self.settings.reconstruction_seconds > 0.0 and (due or estimate.stamp < self._scene_published):
+        due = estimate.stamp - self._scene_published >= nanoseconds(
+            1.0 / self.settings.reconstruction_rate
+        )
+        if self.settings.reconstruction_seconds > 0.0 and (
+            due or estimate.stamp < self._scene_published
+        ):
             self._scene_published = estimate.stamp
-            self.publish("reconstruction", self.scene.record(estimate.stamp))
+            self.publish('reconstruction', self.scene.record(estimate.stamp))
 
     def _publish_map(self) -> None:
         if self.prior_map is None:
             return
         record = map_record(self.now(), self.prior_map)
-        most = self.settings.map_points or len(record.fields["x"])
-        keep = np.linspace(0, len(record.fields["x"]) - 1, min(most, len(record.fields["x"]))).astype(int)
-        thin = CloudRecord(record.stamp, {name: values[keep] for name, values in record.fields.items()})
-        self.publish_message("prior_map", columns_message(ros_messages(), thin))
+        most = self.settings.map_points or len(record.fields['x'])
+        keep = np.linspace(
+            0, len(record.fields['x']) - 1, min(most, len(record.fields['x']))
+        ).astype(int)
+        thin = CloudRecord(
+            record.stamp, {name: values[keep] for name, values in record.fields.items()}
+        )
+        self.publish_message('prior_map', columns_message(ros_messages(), thin))
 
     # ------------------------------------------------ services, initialpose, parameters
 
     def _offer_services(self) -> None:
-        for name, action in (("reset", self._reset), ("save_map", self._save_map),
-                             ("save_trajectory", self._save_trajectory)):
-            self.create_service(Trigger, f"~/{name}", partial(_answer, action))
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._initial_pose, 10)
+        for name, action in (
+            ('reset', self._reset),
+            ('save_map', self._save_map),
+            ('save_trajectory', self._save_trajectory),
+        ):
+            self.create_service(Trigger, f'~/{name}', partial(_answer, action))
+        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self._initial_pose, 10)
 
     def _reset(self) -> str:
         self.in_worker(lambda: self._rebuild(self.robot))
-        return "the estimate starts anew with the next sample"
+        return 'the estimate starts anew with the next sample'
 
     def _save_map(self) -> str:
         points = self.scene.columns()
         if not len(points):
-            raise ValueError("nothing was reconstructed yet")
-        path = self._output("reconstruction.csv")
-        np.savetxt(path, points[:, :3], delimiter=",", header="x,y,z", comments="", fmt="%.6f")
+            raise ValueError('nothing was reconstructed yet')
+        path = self._output('reconstruction.csv')
+        np.savetxt(path, points[:, :3], delimiter=',', header='x,y,z', comments='', fmt='%.6f')
         return str(path)
 
     def _save_trajectory(self) -> str:
@@ -154,9 +177,9 @@ class EstimatorNode(WorkerNode):
 
         track = self.trajectory.track(self.robot)
         if not len(track):
-            raise ValueError("there is no estimate yet")
-        save_tum(track, self._output(""), "estimate")
-        return str(self._output(""))
+            raise ValueError('there is no estimate yet')
+        save_tum(track, self._output(''), 'estimate')
+        return str(self._output(''))
 
     def _output(self, name: str) -> Path:
         folder = Path(self.settings.output_folder).absolute()
@@ -166,19 +189,21 @@ class EstimatorNode(WorkerNode):
     def _initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         """The base's present pose, as RViz's tool gives it; the estimate starts anew from it."""
         try:
-            pose = tracked_pose(message, "base", "initialpose")
+            pose = tracked_pose(message, 'base', 'initialpose')
         except ConvertError as error:
             self.intake.refuse(error.kind, str(error))
             return
         robot = with_base(self.robot, pose.T_map_sensor, pose.covariance, self._insertion)
         self.in_worker(partial(self._rebuild, robot))
-        self.get_logger().info("initialpose: the estimate starts anew from this base")
+        self.get_logger().info('initialpose: the estimate starts anew from this base')
 
     def _change(self, values: dict[str, Any]) -> str | None:
         """Filter settings take effect at once, by a new start; the rest is as for every node."""
         mine = {name: value for name, value in values.items() if name.startswith(FILTER)}
         if mine:
-            self.filter_settings = parameters.read(self, type(self.filter_settings), FILTER, changed=mine)
+            self.filter_settings = parameters.read(
+                self, type(self.filter_settings), FILTER, changed=mine
+            )
             self.in_worker(lambda: self._rebuild(self.robot))
         rest = {name: value for name, value in values.items() if name not in mine}
         return super()._change(rest) if rest else None
@@ -195,15 +220,17 @@ class EstimatorNode(WorkerNode):
 
     def _preset(self) -> EstimatorSettings:
         """The settings asked for, else those bundled for this robot, else the library's defaults."""
-        bundled = (PRESETS_FOLDER / f"{self.robot.name}.yaml").is_file()
+        bundled = (PRESETS_FOLDER / f'{self.robot.name}.yaml').is_file()
         if not self.settings.settings and not bundled:
-            self.get_logger().warning(f"no settings are tuned for robot '{self.robot.name}': using the defaults "
-                                      "(parameter `settings`; `continuum-loc tune` finds better ones)")
+            self.get_logger().warning(
+                f"no settings are tuned for robot '{self.robot.name}': using the defaults "
+                '(parameter `settings`; `continuum-loc tune` finds better ones)'
+            )
         return settings_of(self.robot.name, self.settings.settings)
 
     def _load_map(self) -> Any:
         if not self.settings.map:
-            self.get_logger().warning("no prior map: ToF sensors cannot be used (parameter `map`)")
+            self.get_logger().warning('no prior map: ToF sensors cannot be used (parameter `map`)')
             return None
         from continuum_loc.mapping.prior_map import load_map
 
@@ -211,25 +238,33 @@ class EstimatorNode(WorkerNode):
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:
-            self.get_logger().info("compiling, or loading what an earlier run compiled")
+            self.get_logger().info('compiling, or loading what an earlier run compiled')
             warm_up(self.filter, self.robot, self.filter_settings.window)
             self.filter = self._new_filter(self.robot)
 
 
-def with_base(robot: RobotDescription, T_map_base: np.ndarray, covariance: np.ndarray,
-              insertion: float) -> RobotDescription:
-    """The robot with its base at a pose (4, 4) given at the present insertion [m]. A covariance of zeros keeps the
-    robot's own."""
+def with_base(
+    robot: RobotDescription, T_map_base: np.ndarray, covariance: np.ndarray, insertion: float
+) -> RobotDescription:
+    """
+    The robot with its base at a pose (4, 4) given at the present insertion [m]. A covariance of
+    zeros keeps the robot's own.
+    """
     T_base_zero = np.eye(4)
     T_base_zero[0, 3] = -insertion
     T_map_zero = T_map_base @ T_base_zero
-    rpy = Rotation.from_matrix(T_map_zero[:3, :3]).as_euler("xyz", degrees=True)
-    change: dict[str, Any] = {"xyz": tuple(T_map_zero[:3, 3].tolist()), "rpy_deg": tuple(rpy.tolist())}
+    rpy = Rotation.from_matrix(T_map_zero[:3, :3]).as_euler('xyz', degrees=True)
+    change: dict[str, Any] = {
+        'xyz': tuple(T_map_zero[:3, 3].tolist()),
+        'rpy_deg': tuple(rpy.tolist()),
+    }
     if covariance.any():
-        change["sigma_position"] = float(max(np.sqrt(np.trace(covariance[:3, :3]) / 3.0), 1e-6))
-        change["sigma_rotation_deg"] = float(max(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]) / 3.0)), 1e-6))
+        change['sigma_position'] = float(max(np.sqrt(np.trace(covariance[:3, :3]) / 3.0), 1e-6))
+        change['sigma_rotation_deg'] = float(
+            max(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]) / 3.0)), 1e-6)
+        )
     base = type(robot.base).model_validate(robot.base.model_dump() | change)
-    return type(robot).model_validate(robot.model_dump() | {"base": base.model_dump()})
+    return type(robot).model_validate(robot.model_dump() | {'base': base.model_dump()})
 
 
 def _answer(action: Any, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -250,5 +285,5 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(run(EstimatorNode, args))
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

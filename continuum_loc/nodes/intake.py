@@ -1,45 +1,49 @@
-"""From messages to measurements that may be used: a queue that degrades in a defined order, and rules for stamps.
+"""
+From messages to measurements that may be used: a queue that degrades in a defined order, and rules
+for stamps.
 
 Nothing here imports rclpy, so that all of it is tested without a graph.
 """
 
 from __future__ import annotations
 
-import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
+import threading
+import time
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from continuum_loc.measurements import (
-    NANOSECONDS,
     EncoderSample,
     FieldSample,
     ImuSample,
     Measurement,
+    NANOSECONDS,
+    nanoseconds,
     StrainSample,
     TofFrame,
     TrackedPose,
-    nanoseconds,
 )
 from continuum_loc.nodes.settings import IntakeSettings
 from continuum_loc.robot import RobotDescription
 from msg_tools.convert import strain_is_stamped
 from msg_tools.errors import ConvertError
-from msg_tools.topics import TRACKER, topic_spec
+from msg_tools.topics import topic_spec, TRACKER
+import numpy as np
 
-# What an overloaded node gives up first. IMU samples go last: they carry the motion between all others.
-SACRIFICE = ("tof/points", "strain", "imu/mag", TRACKER, "joint_states", "imu/data_raw")
+# What an overloaded node gives up first. IMU samples go last: they carry the motion between all
+# others.
+SACRIFICE = ('tof/points', 'strain', 'imu/mag', TRACKER, 'joint_states', 'imu/data_raw')
 
 
 class Queued(NamedTuple):
-    """A message as it arrived: its place, topic, message, ROS time (ns) and monotonic time (s) of arrival.
+    """
+    A message as it arrived: its place, topic, message, ROS time (ns) and monotonic time (s) of
+    arrival.
 
-    place: stamp (ns), or the arrival where that is earlier, as stamps from the future must not hold up others; then the
-    order of arrival.
+    place: stamp (ns), or the arrival where that is earlier, as stamps from the future must not
+    hold up others; then the order of arrival.
     """
 
     place: tuple[int, int]
@@ -50,10 +54,11 @@ class Queued(NamedTuple):
 
 
 class Inbox:
-    """The queue between reception (one thread puts) and estimation (one thread takes).
+    """
+    The queue between reception (one thread puts) and estimation (one thread takes).
 
-    Each topic keeps its order of arrival; topics are merged by stamp, because reception takes them one after the other,
-    and a backlog would otherwise tear them apart.
+    Each topic keeps its order of arrival; topics are merged by stamp, because reception takes them
+    one after the other, and a backlog would otherwise tear them apart.
     """
 
     def __init__(self, settings: IntakeSettings) -> None:
@@ -113,20 +118,24 @@ class Inbox:
 
 def rough_stamp(message: Any, arrival: int) -> int:
     """The stamp (ns) of a message that was not checked yet: good enough to sort by."""
-    header = getattr(message, "header", None)
+    header = getattr(message, 'header', None)
     if header is not None:
         return header.stamp.sec * NANOSECONDS + header.stamp.nanosec
-    data = getattr(message, "data", None)
+    data = getattr(message, 'data', None)
     if data is not None and strain_is_stamped(message) and len(data) and np.isfinite(data[0]):
         return nanoseconds(data[0])
     return arrival
 
 
 class StampGate:
-    """Rules for stamps. `judge` returns None to use a sample, or the class of error under which it is refused.
+    """
+    Rules for stamps. `judge` returns None to use a sample, or the class of error under which it is
+    refused.
 
-    A leap beyond the tolerance is believed when `jump_confirmations` samples agree on it and none came meanwhile that
-    does not leap: forward it is a gap, backward the data starts again (`restarts` counts those), as a looped bag does.
+    A leap beyond the tolerance is believed when `jump_confirmations` samples agree on it and none
+    came meanwhile that
+    does not leap: forward it is a gap, backward the data starts again (`restarts` counts those),
+    as a looped bag does.
     """
 
     def __init__(self, settings: IntakeSettings) -> None:
@@ -143,21 +152,23 @@ class StampGate:
     def judge(self, stamp: int, sensor: str, now: int) -> str | None:
         """`stamp`, `now` in ns; now = 0 while a simulated clock has not begun."""
         if stamp == 0:
-            return "zero stamp"
+            return 'zero stamp'
         if now and stamp > now + nanoseconds(self.settings.future_tolerance):
-            return "future stamp"
+            return 'future stamp'
         if self._leaps(stamp) and not self._believed(stamp):
-            return "leap"
+            return 'leap'
         self._leaping.clear()
         seen = self._seen.setdefault(sensor, deque(maxlen=64))
         if stamp in seen:
-            return "duplicate"
+            return 'duplicate'
         seen.append(stamp)
         self.newest = stamp if self.newest is None else max(stamp, self.newest)
         return None
 
     def _leaps(self, stamp: int) -> bool:
-        return self.newest is not None and abs(stamp - self.newest) > nanoseconds(self.settings.jump_tolerance)
+        return self.newest is not None and abs(stamp - self.newest) > nanoseconds(
+            self.settings.jump_tolerance
+        )
 
     def _believed(self, stamp: int) -> bool:
         tolerance = nanoseconds(self.settings.jump_tolerance)
@@ -174,8 +185,13 @@ class StampGate:
 class Intake:
     """Decodes, checks and counts. `report(kind, text)` is called once for each class of error."""
 
-    def __init__(self, robot: RobotDescription, settings: IntakeSettings, report: Callable[[str, str], None],
-                 frame_prefix: str = "") -> None:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        settings: IntakeSettings,
+        report: Callable[[str, str], None],
+        frame_prefix: str = '',
+    ) -> None:
         self.robot, self.settings, self.frame_prefix = robot, settings, frame_prefix
         self.gate = StampGate(settings)
         self.used: Counter[str] = Counter()
@@ -183,17 +199,26 @@ class Intake:
         self._report = report
         self._reported: set[str] = set()
         self._zones = robot.tof_model.rows * robot.tof_model.columns
-        self._names = {TofFrame: _names(robot.tof), ImuSample: _names(robot.imu), FieldSample: _names(robot.hall),
-                       TrackedPose: _names(robot.sensors)}
+        self._names = {
+            TofFrame: _names(robot.tof),
+            ImuSample: _names(robot.imu),
+            FieldSample: _names(robot.hall),
+            TrackedPose: _names(robot.sensors),
+        }
 
     def accept(self, topic: str, message: Any, arrival: int, now: int) -> Measurement | None:
         """The measurement of a message, or None where it is refused (counted, and reported once per class)."""
         try:
             measurement = self._checked(topic, message, arrival)
-            refusal = self.gate.judge(measurement.stamp, getattr(measurement, "sensor", topic), now)
+            refusal = self.gate.judge(
+                measurement.stamp, getattr(measurement, 'sensor', topic), now
+            )
             if refusal:
-                raise ConvertError(refusal, f"{topic}: stamp {measurement.stamp / 1e9:.6f} s refused as {refusal} "
-                                   f"(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {now / 1e9:.6f} s)")
+                raise ConvertError(
+                    refusal,
+                    f'{topic}: stamp {measurement.stamp / 1e9:.6f} s refused as {refusal} '
+                    f'(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {now / 1e9:.6f} s)',
+                )
         except ConvertError as error:
             self.refuse(error.kind, str(error))
             return None
@@ -208,41 +233,61 @@ class Intake:
             self._report(kind, text)
 
     def _checked(self, topic: str, message: Any, arrival: int) -> Measurement:
-        if topic == "strain" and not strain_is_stamped(message) and "unstamped" not in self._reported:
-            self._reported.add("unstamped")
-            self._report("unstamped", "strain: data_offset is 0, so the arrival time has to serve as the stamp")
+        if (
+            topic == 'strain'
+            and not strain_is_stamped(message)
+            and 'unstamped' not in self._reported
+        ):
+            self._reported.add('unstamped')
+            self._report(
+                'unstamped',
+                'strain: data_offset is 0, so the arrival time has to serve as the stamp',
+            )
         measurement = topic_spec(topic).decode(message, arrival, topic)
         measurement = self._without_prefix(measurement)
         names = self._names.get(type(measurement))
         if names is not None and measurement.sensor not in names:
-            raise ConvertError("unknown frame", f"{topic}: robot '{self.robot.name}' has no such sensor "
-                               f"'{measurement.sensor}'; valid: {', '.join(names) or 'none of this kind'}")
+            raise ConvertError(
+                'unknown frame',
+                f"{topic}: robot '{self.robot.name}' has no such sensor "
+                f"'{measurement.sensor}'; valid: {', '.join(names) or 'none of this kind'}",
+            )
         self._check_content(topic, measurement)
         return measurement
 
     def _without_prefix(self, measurement: Any) -> Any:
         prefix = self.frame_prefix
-        if prefix and getattr(measurement, "sensor", "").startswith(prefix):
-            return replace(measurement, sensor=measurement.sensor[len(prefix):])
+        if prefix and getattr(measurement, 'sensor', '').startswith(prefix):
+            return replace(measurement, sensor=measurement.sensor[len(prefix) :])
         return measurement
 
     def _check_content(self, topic: str, measurement: Measurement) -> None:
         if isinstance(measurement, TofFrame) and len(measurement.ranges) != self._zones:
-            raise ConvertError("zones", f"{topic}: {len(measurement.ranges)} zones of '{measurement.sensor}'; the "
-                               f"robot description says {self._zones}")
+            raise ConvertError(
+                'zones',
+                f"{topic}: {len(measurement.ranges)} zones of '{measurement.sensor}'; the "
+                f'robot description says {self._zones}',
+            )
         if isinstance(measurement, StrainSample):
             self._check_stations(topic, measurement.s)
-        if isinstance(measurement, EncoderSample) and "insertion" in measurement.names:
-            travel = measurement.position[measurement.names.index("insertion")]
+        if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
+            travel = measurement.position[measurement.names.index('insertion')]
             if not np.isfinite(travel):
-                raise ConvertError("value", f"{topic}: the position of joint 'insertion' is {travel}")
+                raise ConvertError(
+                    'value', f"{topic}: the position of joint 'insertion' is {travel}"
+                )
 
     def _check_stations(self, topic: str, s: np.ndarray) -> None:
         if self.robot.strain is None:
-            raise ConvertError("unknown frame", f"{topic}: robot '{self.robot.name}' has no strain sensor")
+            raise ConvertError(
+                'unknown frame', f"{topic}: robot '{self.robot.name}' has no strain sensor"
+            )
         if s.min() < -1e-6 or s.max() > self.robot.length + 1e-6 or (np.diff(s) <= 0.0).any():
-            raise ConvertError("value", f"{topic}: stations s must rise within 0 to {self.robot.length} m, got "
-                               f"{s.min():.4g} to {s.max():.4g}")
+            raise ConvertError(
+                'value',
+                f'{topic}: stations s must rise within 0 to {self.robot.length} m, got '
+                f'{s.min():.4g} to {s.max():.4g}',
+            )
 
 
 def _names(sensors: tuple) -> tuple[str, ...]:

@@ -1,19 +1,21 @@
-"""A whole live graph for a limited time: simulator, estimator and recorder as processes of their own.
+"""
+A whole live graph for a limited time: simulator, estimator and recorder as processes of their own.
 
-`run_live` is what `continuum-loc demo` calls. Nothing here imports rclpy: the caller's process joins no graph.
+`run_live` is what `continuum-loc demo` calls. Nothing here imports rclpy: the caller's process
+joins no graph.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 import json
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 START_LIMIT = 180.0  # s; the first run compiles
@@ -27,11 +29,13 @@ class LiveError(RuntimeError):
 
 @dataclass(frozen=True)
 class LiveResult:
-    """What a live run left behind.
+    """
+    What a live run left behind.
 
-    bag: folder of the recorded bag. latency_ms, lag_ms, step_ms: count, mean, p50, p95, p99, max of the delay from
-    sensor stamp to published pose, from reception to published pose, and of the filter step. latencies_s: each
-    latency. counts: per node, what was published, received, used, refused, dropped and written.
+    bag: folder of the recorded bag. latency_ms, lag_ms, step_ms: count, mean, p50, p95, p99, max
+    of the delay from sensor stamp to published pose, from reception to published pose, and of the
+    filter step. latencies_s: each latency. counts: per node, what was published, received, used,
+    refused, dropped and written.
     lost: messages that were published but never reached the estimator or the bag, by topic.
     """
 
@@ -48,30 +52,42 @@ class LiveResult:
 class _Process:
     """One node: its log goes to a file, which is quoted when it fails."""
 
-    def __init__(self, node: str, parameters: dict[str, Any], folder: Path, environment: dict[str, str]) -> None:
-        self.node, self.log = node, folder / f"{node}.log"
-        arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={_yaml(value)}")]
-        with self.log.open("w") as log:
+    def __init__(
+        self, node: str, parameters: dict[str, Any], folder: Path, environment: dict[str, str]
+    ) -> None:
+        self.node, self.log = node, folder / f'{node}.log'
+        arguments = [
+            part
+            for name, value in parameters.items()
+            for part in ('-p', f'{name}:={_yaml(value)}')
+        ]
+        with self.log.open('w') as log:
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", f"continuum_loc.nodes.{node}", "--ros-args", *arguments],
-                stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
+                [sys.executable, '-m', f'continuum_loc.nodes.{node}', '--ros-args', *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
 
     def running(self) -> bool:
         """Whether it runs; raises LiveError where it failed."""
         code = self._popen.poll()
         if code not in (None, 0):
-            tail = "\n".join(self.log.read_text(errors="replace").splitlines()[-15:])
-            raise LiveError(f"node {self.node} ended with {code}; the end of {self.log}:\n{tail}")
+            tail = '\n'.join(self.log.read_text(errors='replace').splitlines()[-15:])
+            raise LiveError(f'node {self.node} ended with {code}; the end of {self.log}:\n{tail}')
         return code is None
 
     def await_log(self, text: str, limit: float) -> None:
         """Wait until the node's log says `text`."""
         deadline = time.monotonic() + limit
-        while text not in self.log.read_text(errors="replace"):
+        while text not in self.log.read_text(errors='replace'):
             if not self.running():
-                raise LiveError(f"node {self.node} ended before it was ready; see {self.log}")
+                raise LiveError(f'node {self.node} ended before it was ready; see {self.log}')
             if time.monotonic() > deadline:
-                raise LiveError(f"node {self.node} was not ready after {limit:g} s; see {self.log}")
+                raise LiveError(
+                    f'node {self.node} was not ready after {limit:g} s; see {self.log}'
+                )
             time.sleep(POLL)
 
     def stop(self) -> None:
@@ -82,7 +98,9 @@ class _Process:
             self._popen.wait(STOP_LIMIT)
         except subprocess.TimeoutExpired:
             self._popen.kill()
-            raise LiveError(f"node {self.node} did not stop within {STOP_LIMIT:g} s; see {self.log}") from None
+            raise LiveError(
+                f'node {self.node} did not stop within {STOP_LIMIT:g} s; see {self.log}'
+            ) from None
         self.running()
 
     def kill(self) -> None:
@@ -92,40 +110,69 @@ class _Process:
             self._popen.wait()
 
 
-def run_live(folder: str | Path, *, robot: str = "engine", scene: str = "S0", trajectory: str = "t1",
-             prior_map: str | Path = "", duration: float = 20.0, seed: int = 0, profile: str = "live",
-             tof_fidelity: str = "paper", settings: str = "", domain_id: int | None = None,
-             progress: Callable[[str, float], None] | None = None) -> LiveResult:
-    """Simulate, estimate and record live over real ROS 2, `duration` seconds of data, into `folder`/bag.
+def run_live(
+    folder: str | Path,
+    *,
+    robot: str = 'engine',
+    scene: str = 'S0',
+    trajectory: str = 't1',
+    prior_map: str | Path = '',
+    duration: float = 20.0,
+    seed: int = 0,
+    profile: str = 'live',
+    tof_fidelity: str = 'paper',
+    settings: str = '',
+    domain_id: int | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> LiveResult:
+    """
+    Simulate, estimate and record live over real ROS 2, `duration` seconds of data, into
+    `folder`/bag.
 
-    robot, scene, prior_map, settings: bundled names or files. domain_id: ROS_DOMAIN_ID of the private graph
-    (default: one from the process id). progress(stage, share): called as it goes on, share in [0, 1].
-    Raises LiveError where a node fails; no process is left behind.
+    robot, scene, prior_map, settings: bundled names or files. domain_id: ROS_DOMAIN_ID of the
+    private graph (default: one from the process id). progress(stage, share): called as it goes on,
+    share in [0, 1]. Raises LiveError where a node fails; no process is left behind.
     """
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda stage, share: None)
     environment = _environment(domain_id)
-    common = {"robot": robot}
+    common = {'robot': robot}
     started: list[_Process] = []
 
     def start(node: str, **parameters: Any) -> _Process:
-        path = folder / f"{node}.json"
+        path = folder / f'{node}.json'
         path.unlink(missing_ok=True)
-        started.append(_Process(node, parameters | {"summary_file": str(path)}, folder, environment))
+        started.append(
+            _Process(node, parameters | {'summary_file': str(path)}, folder, environment)
+        )
         return started[-1]
 
     try:
-        tell("starting the nodes", 0.0)
+        tell('starting the nodes', 0.0)
         # The simulator publishes reliably, so on a busy machine nothing need be lost on the way.
-        recorder = start("recorder", bag=str(folder / "bag"), reliable_inputs=True)
-        estimator = start("estimator", map=str(prior_map), settings=settings,
-                          **{"intake.reliable_inputs": True}, **common)
-        recorder.await_log("recording", START_LIMIT)
-        estimator.await_log("ready:", START_LIMIT)
+        recorder = start('recorder', bag=str(folder / 'bag'), reliable_inputs=True)
+        estimator = start(
+            'estimator',
+            map=str(prior_map),
+            settings=settings,
+            **{'intake.reliable_inputs': True},
+            **common,
+        )
+        recorder.await_log('recording', START_LIMIT)
+        estimator.await_log('ready:', START_LIMIT)
         # The simulator holds its data back until estimator and recorder both listen to it.
-        simulator = start("simulator", scene=scene, trajectory=trajectory, duration=float(duration), seed=seed,
-                          profile=profile, tof_fidelity=tof_fidelity, wait_for=2, **common)
+        simulator = start(
+            'simulator',
+            scene=scene,
+            trajectory=trajectory,
+            duration=float(duration),
+            seed=seed,
+            profile=profile,
+            tof_fidelity=tof_fidelity,
+            wait_for=2,
+            **common,
+        )
         _follow(simulator, (recorder, estimator), duration, tell)
         time.sleep(0.5)  # the last estimate is still on its way into the bag
         for process in (simulator, estimator, recorder):
@@ -136,28 +183,40 @@ def run_live(folder: str | Path, *, robot: str = "engine", scene: str = "S0", tr
     return _result(folder, tuple(process.log for process in started))
 
 
-def _follow(simulator: _Process, others: tuple[_Process, ...], duration: float,
-            tell: Callable[[str, float], None]) -> None:
+def _follow(
+    simulator: _Process,
+    others: tuple[_Process, ...],
+    duration: float,
+    tell: Callable[[str, float], None],
+) -> None:
     begin: float | None = None
     while simulator.running():
         for process in others:
             if not process.running():
-                raise LiveError(f"node {process.node} ended while the data was flowing; see {process.log}")
-        if begin is None and "data begins" in simulator.log.read_text(errors="replace"):
+                raise LiveError(
+                    f'node {process.node} ended while the data was flowing; see {process.log}'
+                )
+        if begin is None and 'data begins' in simulator.log.read_text(errors='replace'):
             begin = time.monotonic()
         if begin is not None:
-            tell("live", min((time.monotonic() - begin) / duration, 1.0))
+            tell('live', min((time.monotonic() - begin) / duration, 1.0))
         time.sleep(POLL)
-    tell("live", 1.0)
+    tell('live', 1.0)
 
 
 def _environment(domain_id: int | None) -> dict[str, str]:
     """The children's: a graph of their own on this machine, and one thread for each numerical library."""
     domain = domain_id if domain_id is not None else 1 + os.getpid() % 100
-    own = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "OMP_NUM_THREADS": "1",
-           "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-    # Where the ROS packages come as wheels, they mark the environment that they have set up: a child does its own.
-    dropped = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "ROS_STATIC_PEERS")
+    own = {
+        'ROS_DOMAIN_ID': str(domain),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'OMP_NUM_THREADS': '1',
+        'OPENBLAS_NUM_THREADS': '1',
+        'PYTHONUNBUFFERED': '1',
+    }
+    # Where the ROS packages come as wheels, they mark the environment that they have set up: a
+    # child does its own.
+    dropped = ('_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'ROS_STATIC_PEERS')
     return {name: value for name, value in os.environ.items() if name not in dropped} | own
 
 
@@ -166,15 +225,32 @@ def _yaml(value: Any) -> str:
 
 
 def _result(folder: Path, logs: tuple[Path, ...]) -> LiveResult:
-    read = {node: json.loads((folder / f"{node}.json").read_text()) for node in ("simulator", "estimator", "recorder")}
-    estimator = read["estimator"]
-    published, received = read["simulator"]["published"], estimator["counts"]["received"]
-    written = read["recorder"]["written"]
-    lost = {f"{topic} -> bag": count - written.get(topic, 0) for topic, count in published.items()}
-    lost |= {f"{topic} -> estimator": count - received.get(topic, 0) for topic, count in published.items()
-             if topic != "ground_truth/poses"}
-    counts = {"simulator": {"published": published, "delay_ms": read["simulator"]["delay_ms"]},
-              "estimator": estimator["counts"], "filter": estimator["filter"], "recorder": {"written": written}}
-    return LiveResult(bag=folder / "bag", latency_ms=estimator["latency_ms"], lag_ms=estimator["lag_ms"],
-                      step_ms=estimator["step_ms"], latencies_s=estimator["latencies_s"], counts=counts,
-                      lost={where: count for where, count in lost.items() if count}, logs=logs)
+    read = {
+        node: json.loads((folder / f'{node}.json').read_text())
+        for node in ('simulator', 'estimator', 'recorder')
+    }
+    estimator = read['estimator']
+    published, received = read['simulator']['published'], estimator['counts']['received']
+    written = read['recorder']['written']
+    lost = {f'{topic} -> bag': count - written.get(topic, 0) for topic, count in published.items()}
+    lost |= {
+        f'{topic} -> estimator': count - received.get(topic, 0)
+        for topic, count in published.items()
+        if topic != 'ground_truth/poses'
+    }
+    counts = {
+        'simulator': {'published': published, 'delay_ms': read['simulator']['delay_ms']},
+        'estimator': estimator['counts'],
+        'filter': estimator['filter'],
+        'recorder': {'written': written},
+    }
+    return LiveResult(
+        bag=folder / 'bag',
+        latency_ms=estimator['latency_ms'],
+        lag_ms=estimator['lag_ms'],
+        step_ms=estimator['step_ms'],
+        latencies_s=estimator['latencies_s'],
+        counts=counts,
+        lost={where: count for where, count in lost.items() if count},
+        logs=logs,
+    )

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 
-import numpy as np
-
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.evaluation.tracks import BASE, Track
-from continuum_loc.measurements import TofFrame, nanoseconds
+from continuum_loc.measurements import nanoseconds, TofFrame
 from continuum_loc.robot import RobotDescription
 from msg_tools.records import CloudRecord
+import numpy as np
 
 
 class Trajectory:
@@ -38,7 +37,11 @@ class Trajectory:
         names = (BASE, *robot.ring_names)
         if not poses:
             return Track.empty(names)
-        return Track(np.array([stamp for stamp, _ in poses], np.int64), names, np.stack([T for _, T in poses]))
+        return Track(
+            np.array([stamp for stamp, _ in poses], np.int64),
+            names,
+            np.stack([T for _, T in poses]),
+        )
 
 
 class SeenScene:
@@ -56,10 +59,19 @@ class SeenScene:
 
     def place(self, estimate: Estimate, duration: float) -> None:
         """Place the waiting frames by an estimate made at their instant; forget what is older than `duration` [s]."""
-        frames = [frame for frame in self._waiting if abs(frame.stamp - estimate.stamp) < nanoseconds(0.005)]
+        frames = [
+            frame
+            for frame in self._waiting
+            if abs(frame.stamp - estimate.stamp) < nanoseconds(0.005)
+        ]
         self._waiting = []
-        if frames and estimate.status == "tracking":
-            self._seen.append((estimate.stamp, np.concatenate([self._placed(frame, estimate) for frame in frames])))
+        if frames and estimate.status == 'tracking':
+            self._seen.append(
+                (
+                    estimate.stamp,
+                    np.concatenate([self._placed(frame, estimate) for frame in frames]),
+                )
+            )
         while self._seen and self._seen[0][0] < estimate.stamp - nanoseconds(duration):
             self._seen.popleft()
 
@@ -75,8 +87,16 @@ class SeenScene:
     def record(self, stamp: int, anomaly: np.ndarray | None = None) -> CloudRecord:
         """The points as the `reconstruction` topic carries them."""
         x, y, z, sigma = self.columns().T
-        return CloudRecord(stamp, {"x": x, "y": y, "z": z, "sigma": sigma,
-                                   "anomaly": np.zeros_like(x) if anomaly is None else anomaly})
+        return CloudRecord(
+            stamp,
+            {
+                'x': x,
+                'y': y,
+                'z': z,
+                'sigma': sigma,
+                'anomaly': np.zeros_like(x) if anomaly is None else anomaly,
+            },
+        )
 
     def _placed(self, frame: TofFrame, estimate: Estimate) -> np.ndarray:
         """(N, 4) of the zones with a return. The standard deviation is the beam's and the ring's together, eq. 11."""

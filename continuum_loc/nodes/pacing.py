@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Iterator
 from queue import Empty, Full, Queue
+import threading
+import time
 from typing import Any
 
 from continuum_loc.measurements import NANOSECONDS
@@ -15,26 +15,34 @@ POLL = 0.1  # s; how often a blocked thread looks whether it has to stop
 
 
 class Paced:
-    """Delivers (stamp, item) pairs of an iterator when their time has come.
+    """
+    Delivers (stamp, item) pairs of an iterator when their time has come.
 
     lookahead [s]: how far the iterator may run ahead. rate: data seconds per second.
     """
 
-    def __init__(self, items: Iterator[tuple[int, Any]], lookahead: float, rate: float = 1.0) -> None:
+    def __init__(
+        self, items: Iterator[tuple[int, Any]], lookahead: float, rate: float = 1.0
+    ) -> None:
         self._items, self._lookahead, self._rate = items, lookahead, rate
         self._queue: Queue[Any] = Queue(maxsize=4000)
         self._stop = threading.Event()
         self._full = threading.Event()  # the first lookahead is prepared, or all there is
         self._progress: int | None = None  # data stamp delivered last, at first the first
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._prepare, name="lookahead", daemon=True)
+        self._thread = threading.Thread(target=self._prepare, name='lookahead', daemon=True)
 
-    def run(self, deliver: Callable[[int, Any, float], None],
-            on_start: Callable[[int], None] = lambda stamp: None) -> None:
-        """Deliver everything, then return; `stop` from another thread ends it early.
+    def run(
+        self,
+        deliver: Callable[[int, Any, float], None],
+        on_start: Callable[[int], None] = lambda stamp: None,
+    ) -> None:
+        """
+        Deliver everything, then return; `stop` from another thread ends it early.
 
-        `deliver(stamp, item, delay)`: delay [s] behind the item's time. `on_start(first stamp)` is called when the
-        first lookahead is prepared (what compiles at its first use has then compiled) and due one lookahead from now.
+        `deliver(stamp, item, delay)`: delay [s] behind the item's time. `on_start(first stamp)` is
+        called when the first lookahead is prepared (what compiles at its first use has then
+        compiled) and due one lookahead from now.
         """
         self._thread.start()
         while not self._full.wait(POLL) and not self._stop.is_set():

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import sys
-import threading
 from collections import Counter
 from datetime import datetime
 from functools import partial
 from queue import Empty, SimpleQueue
+import sys
+import threading
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy
-
-from continuum_loc.nodes.runtime import PackageNode, input_qos, run, write_summary
+from continuum_loc.nodes.runtime import input_qos, PackageNode, run, write_summary
 from continuum_loc.nodes.settings import RecorderNodeSettings
 from continuum_loc.settings import SettingsError
 from msg_tools.bag import BagWriter, split_topic
-from msg_tools.topics import TOPICS, TRACKER, topic_spec
+from msg_tools.topics import topic_spec, TOPICS, TRACKER
+from rclpy.qos import DurabilityPolicy
 
-WATCH_PERIOD = 0.5  # s; trackers are found on the graph, as only the robot description could name them before
+WATCH_PERIOD = (
+    0.5  # s; trackers are found on the graph, as only the robot description could name them before
+)
 POLL = 0.1
 
 
@@ -26,16 +27,16 @@ class RecorderNode(PackageNode):
     """Callbacks queue serialised messages; one thread writes them."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("recorder", RecorderNodeSettings(), **options)
+        super().__init__('recorder', RecorderNodeSettings(), **options)
         self.check_parameters()
         self.topics = self._wanted()
-        path = self.settings.bag or f"bag_{datetime.now():%Y%m%d_%H%M%S}"
+        path = self.settings.bag or f'bag_{datetime.now():%Y%m%d_%H%M%S}'
         self.bag = BagWriter(path, self.get_namespace())
         self.written: Counter[str] = Counter()
         self._queue: SimpleQueue[tuple[str, bytes, int]] = SimpleQueue()
         self._stop = threading.Event()
         self._failure: OSError | None = None
-        self._thread = threading.Thread(target=self._write, name="writer", daemon=True)
+        self._thread = threading.Thread(target=self._write, name='writer', daemon=True)
         self._thread.start()
         self._subscribed: set[str] = set()
         for topic in self.topics:
@@ -43,30 +44,36 @@ class RecorderNode(PackageNode):
                 self._subscribe(topic)
         if TRACKER in self.topics:
             self.create_timer(WATCH_PERIOD, self._find_trackers)
-        self.get_logger().info(f"recording {len(self._subscribed)} topics into {path}")
+        self.get_logger().info(f'recording {len(self._subscribed)} topics into {path}')
 
     def close(self) -> None:
         """Write what is queued, and the bag's index."""
         self._stop.set()
         self._thread.join(timeout=60.0)
         self.bag.close()
-        write_summary(self.settings.summary_file, {"bag": str(self.bag.path), "written": dict(self.written)})
+        write_summary(
+            self.settings.summary_file, {'bag': str(self.bag.path), 'written': dict(self.written)}
+        )
         if self._failure is not None:
             raise self._failure
 
     def _wanted(self) -> list[str]:
-        if self.settings.topics == ("all",):
+        if self.settings.topics == ('all',):
             return list(TOPICS)
         unknown = [topic for topic in self.settings.topics if topic not in TOPICS]
         if unknown:
-            raise SettingsError(f"parameter 'topics': no topic '{unknown[0]}' in the contract; valid: all, "
-                                + ", ".join(TOPICS))
+            raise SettingsError(
+                f"parameter 'topics': no topic '{unknown[0]}' in the contract; valid: all, "
+                + ', '.join(TOPICS)
+            )
         return list(self.settings.topics)
 
     def _subscribe(self, topic: str) -> None:
         spec = topic_spec(topic)
         qos = input_qos(spec, self.settings.reliable_inputs)
-        if spec.latched:  # a latched message of before our start is only given to those who ask for it
+        if (
+            spec.latched
+        ):  # a latched message of before our start is only given to those who ask for it
             qos = input_qos(spec, True)
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
         self.listen(spec.type, topic, partial(self._receive, topic), qos, raw=True)
@@ -75,7 +82,11 @@ class RecorderNode(PackageNode):
     def _find_trackers(self) -> None:
         for name, types in self.get_topic_names_and_types():
             split = split_topic(name, types[0])
-            if split is None or split[0] != self.get_namespace().strip("/") or not split[1].startswith(TRACKER):
+            if (
+                split is None
+                or split[0] != self.get_namespace().strip('/')
+                or not split[1].startswith(TRACKER)
+            ):
                 continue
             if split[1] not in self._subscribed:
                 self._subscribe(split[1])
@@ -105,5 +116,5 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(run(RecorderNode, args))
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

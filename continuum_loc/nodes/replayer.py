@@ -2,46 +2,47 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+import sys
+import threading
+import time
 from typing import Any
-
-from rosgraph_msgs.msg import Clock
 
 from continuum_loc.measurements import nanoseconds
 from continuum_loc.nodes.pacing import Paced
-from continuum_loc.nodes.runtime import PackageNode, output_qos, run
+from continuum_loc.nodes.runtime import output_qos, PackageNode, run
 from continuum_loc.nodes.settings import ReplayerNodeSettings
 from continuum_loc.settings import SettingsError
 from msg_tools.bag import contract_topics, open_bag, raw_messages
 from msg_tools.convert import time_message
 from msg_tools.errors import BagError
 from msg_tools.factory import ros_messages
-from msg_tools.topics import INPUTS, TOPICS, TRACKER, topic_spec
+from msg_tools.topics import INPUTS, topic_spec, TOPICS, TRACKER
+from rosgraph_msgs.msg import Clock
 
 LOOKAHEAD = 0.5  # s
 SETTLED_MATCH = 0.5  # s after discovery says that all is matched until the data begins
-CLOCK = "/clock"
+CLOCK = '/clock'
 
 
 class ReplayerNode(PackageNode):
     """Publishes serialised messages as they are in the bag, at the pace of the log."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("replayer", ReplayerNodeSettings(), **options)
+        super().__init__('replayer', ReplayerNodeSettings(), **options)
         self.check_parameters()
         self.path = Path(self.settings.bag)
         self.published: Counter[str] = Counter()
         self.outputs = {topic: self._publisher(topic) for topic in self._topics()}
-        self._clock_output = self.create_publisher(Clock, CLOCK, 10) if self.settings.clock else None
+        self._clock_output = (
+            self.create_publisher(Clock, CLOCK, 10) if self.settings.clock else None
+        )
         self._paced: Paced | None = None
         self._stop = threading.Event()
         self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._play, name="player", daemon=True)
+        self._thread = threading.Thread(target=self._play, name='player', daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -55,17 +56,27 @@ class ReplayerNode(PackageNode):
 
     def _topics(self) -> list[str]:
         with open_bag(self.path) as reader:
-            names = contract_topics(self.path, reader.connections, self.settings.namespace_in_bag or None)
+            names = contract_topics(
+                self.path, reader.connections, self.settings.namespace_in_bag or None
+            )
         present = set(names.values())
         chosen = self.settings.topics
-        if chosen == ("inputs",):
-            chosen = (*INPUTS, TRACKER, "ground_truth/poses")
+        if chosen == ('inputs',):
+            chosen = (*INPUTS, TRACKER, 'ground_truth/poses')
         unknown = [topic for topic in chosen if topic not in TOPICS]
         if unknown:
-            raise SettingsError(f"parameter 'topics': no topic '{unknown[0]}'; valid: inputs, {', '.join(TOPICS)}")
-        topics = [topic for topic in present if topic in chosen or (TRACKER in chosen and topic.startswith(TRACKER))]
+            raise SettingsError(
+                f"parameter 'topics': no topic '{unknown[0]}'; valid: inputs, {', '.join(TOPICS)}"
+            )
+        topics = [
+            topic
+            for topic in present
+            if topic in chosen or (TRACKER in chosen and topic.startswith(TRACKER))
+        ]
         if not topics:
-            raise BagError(f"{self.path}: none of {', '.join(chosen)} is in it; it holds {', '.join(sorted(present))}")
+            raise BagError(
+                f'{self.path}: none of {", ".join(chosen)} is in it; it holds {", ".join(sorted(present))}'
+            )
         return sorted(topics)
 
     def _publisher(self, topic: str) -> Any:
@@ -87,12 +98,19 @@ class ReplayerNode(PackageNode):
 
     def _wait_for_listeners(self) -> None:
         """Begin when as many subscriptions as asked for listen to the bag's busiest kind of sensor."""
-        first = next((topic for topic in INPUTS if topic in self.outputs), next(iter(self.outputs)))
+        first = next(
+            (topic for topic in INPUTS if topic in self.outputs), next(iter(self.outputs))
+        )
         deadline = time.monotonic() + self.settings.wait_timeout
-        while self.outputs[first].get_subscription_count() < self.settings.wait_for and not self._stop.is_set():
+        while (
+            self.outputs[first].get_subscription_count() < self.settings.wait_for
+            and not self._stop.is_set()
+        ):
             if time.monotonic() > deadline:
-                raise TimeoutError(f"fewer than {self.settings.wait_for} subscriptions listen to {first} after "
-                                   f"{self.settings.wait_timeout:g} s")
+                raise TimeoutError(
+                    f'fewer than {self.settings.wait_for} subscriptions listen to {first} after '
+                    f'{self.settings.wait_timeout:g} s'
+                )
             time.sleep(0.02)
         if self.settings.wait_for:
             time.sleep(SETTLED_MATCH)
@@ -101,10 +119,12 @@ class ReplayerNode(PackageNode):
         """The bag's messages, and ticks of the clock between them."""
         period = nanoseconds(1.0 / self.settings.clock_rate)
         tick = 0
-        for topic, stamp, data in raw_messages(self.path, tuple(self.outputs), self.settings.namespace_in_bag):
+        for topic, stamp, data in raw_messages(
+            self.path, tuple(self.outputs), self.settings.namespace_in_bag
+        ):
             tick = tick or stamp
             while self._clock_output is not None and tick <= stamp:
-                yield tick, (CLOCK, b"")
+                yield tick, (CLOCK, b'')
                 tick += period
             yield stamp, (topic, data)
 
@@ -122,5 +142,5 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(run(ReplayerNode, args))
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

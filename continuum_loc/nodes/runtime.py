@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-import tempfile
 from collections import deque
 from collections.abc import Callable
+import json
+import os
 from pathlib import Path
+import sys
+import tempfile
 from typing import Any
 
+from continuum_loc.nodes.parameters import declare, refuse_unknown
+from continuum_loc.settings import Settings, SettingsError
+from msg_tools.errors import BagError, ConvertError
+from msg_tools.factory import ros_messages
+from msg_tools.topics import Topic
 import numpy as np
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError  # rclpy gives it no public name
@@ -18,12 +23,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-
-from continuum_loc.nodes.parameters import declare, refuse_unknown
-from continuum_loc.settings import Settings, SettingsError
-from msg_tools.errors import BagError, ConvertError
-from msg_tools.factory import ros_messages
-from msg_tools.topics import Topic
 
 BAD_INPUT = 2
 
@@ -44,21 +43,33 @@ class PackageNode(Node):
     def close(self) -> None:
         """Stop threads, write files. Called once, after the last callback."""
 
-    def listen(self, type_name: str, topic: str, callback: Callable[[Any], None], qos: QoSProfile,
-               raw: bool = False) -> None:
-        """Subscribe, taking all that waits at each wake-up.
-
-        An executor takes one message of each topic in turn, so that in a backlog the busy topics fall behind the
-        quiet ones; and it builds a wait set for each.
+    def listen(
+        self,
+        type_name: str,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile,
+        raw: bool = False,
+    ) -> None:
         """
+        Subscribe, taking all that waits at each wake-up.
+
+        An executor takes one message of each topic in turn, so that in a backlog the busy topics
+        fall behind the quiet ones; and it builds a wait set for each.
+        """
+
         def take(message: Any) -> None:
             while message is not None:
                 callback(message)
                 with subscription.handle:
-                    taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                    taken = subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    )
                 message = None if taken is None else taken[0]
 
-        subscription = self.create_subscription(ros_messages().resolve(type_name), topic, take, qos, raw=raw)
+        subscription = self.create_subscription(
+            ros_messages().resolve(type_name), topic, take, qos, raw=raw
+        )
 
     def now(self) -> int:
         """The node's clock in integer nanoseconds (0 while a simulated clock has not begun)."""
@@ -75,7 +86,7 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args)
     except RCLError as error:  # arguments after --ros-args that ROS does not understand
-        print(f"error: {error}", file=sys.stderr)
+        print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
     node: PackageNode | None = None
     try:
@@ -108,16 +119,16 @@ def _complain(error: Exception) -> int:
     from continuum_loc.mapping.errors import MapError
 
     known = (SettingsError, MapError, BagError, ConvertError)
-    if isinstance(error, known) or type(error).__name__ in ("SceneError", "SimulationDiverged"):
-        print(f"error: {error}", file=sys.stderr)
+    if isinstance(error, known) or type(error).__name__ in ('SceneError', 'SimulationDiverged'):
+        print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
     raise error
 
 
 def _provide_log_folder() -> None:
     """rclpy.init fails where it finds no place for logs, as in a container without HOME."""
-    if not any(os.environ.get(name) for name in ("HOME", "ROS_HOME", "ROS_LOG_DIR")):
-        os.environ["ROS_LOG_DIR"] = tempfile.gettempdir()
+    if not any(os.environ.get(name) for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR')):
+        os.environ['ROS_LOG_DIR'] = tempfile.gettempdir()
 
 
 def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
@@ -129,8 +140,12 @@ def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
 def output_qos(topic: Topic) -> QoSProfile:
     """Reliable, which every subscription accepts; latched where the contract says so."""
     durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=ReliabilityPolicy.RELIABLE,
-                      durability=durability)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=topic.depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )
 
 
 def write_summary(path: str, data: dict[str, Any]) -> None:
@@ -139,7 +154,7 @@ def write_summary(path: str, data: dict[str, Any]) -> None:
         return
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_suffix(".partial")
+    partial = target.with_suffix('.partial')
     partial.write_text(json.dumps(data, indent=1))
     partial.replace(target)
 
@@ -160,8 +175,14 @@ class Delays:
             return {}
         ms = 1e3 * np.array(self.values)
         p50, p95, p99 = np.percentile(ms, (50, 95, 99))
-        return {"count": len(ms), "mean": float(ms.mean()), "p50": float(p50), "p95": float(p95), "p99": float(p99),
-                "max": float(ms.max())}
+        return {
+            'count': len(ms),
+            'mean': float(ms.mean()),
+            'p50': float(p50),
+            'p95': float(p95),
+            'p99': float(p99),
+            'max': float(ms.max()),
+        }
 
     def recent(self, count: int) -> np.ndarray:
         """(<= count,) the newest delays [s]."""

@@ -5,36 +5,39 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import numpy as np
-from std_srvs.srv import Trigger
-
 from continuum_loc.measurements import Measurement
 from continuum_loc.nodes.runtime import run
 from continuum_loc.nodes.settings import ShapeNodeSettings
 from continuum_loc.nodes.warm_up import rest_samples
 from continuum_loc.nodes.worker import ERROR, OK, WARN, WorkerNode
-from continuum_loc.shape import ShapeEstimate, ShapeEstimator, ShapeSettings, load_shape_settings
+from continuum_loc.shape import load_shape_settings, ShapeEstimate, ShapeEstimator, ShapeSettings
 from msg_tools.records import PathRecord, PosesRecord
+import numpy as np
+from std_srvs.srv import Trigger
 
 
 class ShapeNode(WorkerNode):
     """The shape estimator on a graph."""
 
-    inputs = ("imu/data_raw", "imu/mag")
+    inputs = ('imu/data_raw', 'imu/mag')
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("shape", ShapeNodeSettings(), **options)
+        super().__init__('shape', ShapeNodeSettings(), **options)
         self.check_parameters()
-        chosen = load_shape_settings(self.settings.settings) if self.settings.settings else ShapeSettings()
+        chosen = (
+            load_shape_settings(self.settings.settings)
+            if self.settings.settings
+            else ShapeSettings()
+        )
         self.estimator = ShapeEstimator(self.robot, chosen)
         self.estimate: ShapeEstimate | None = None
-        self.get_logger().info("compiling, or loading what an earlier run compiled")
+        self.get_logger().info('compiling, or loading what an earlier run compiled')
         for sample in rest_samples(self.robot, 1.0):
             self.estimator.process(sample)
         self.estimator = ShapeEstimator(self.robot, chosen)
-        for topic in ("shape/poses", "shape/curve"):
+        for topic in ('shape/poses', 'shape/curve'):
             self.publisher(topic)
-        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_service(Trigger, '~/reset', self._reset)
         self.begin()
 
     def consume(self, measurement: Measurement) -> int | None:
@@ -43,8 +46,8 @@ class ShapeNode(WorkerNode):
         if estimate is None:
             return None
         self.estimate = estimate
-        self.publish("shape/poses", PosesRecord(estimate.stamp, estimate.T_map_module))
-        self.publish("shape/curve", PathRecord(estimate.stamp, frames_along(estimate.curve)))
+        self.publish('shape/poses', PosesRecord(estimate.stamp, estimate.T_map_module))
+        self.publish('shape/curve', PathRecord(estimate.stamp, frames_along(estimate.curve)))
         return estimate.stamp
 
     def restart(self) -> None:
@@ -55,23 +58,28 @@ class ShapeNode(WorkerNode):
     def describe(self) -> tuple[int, str, dict[str, Any]]:
         """A faulty module is an error, taring a warning."""
         status, faults = self.estimator.status, self.estimator.faults
-        values = {"status": status, "faults": "; ".join(f"{k}: {', '.join(v)}" for k, v in faults.items()) or "none"}
+        values = {
+            'status': status,
+            'faults': '; '.join(f'{k}: {", ".join(v)}' for k, v in faults.items()) or 'none',
+        }
         if self.estimate is not None:
-            values |= {"consistency": float(self.estimate.consistency),
-                       "yaw sigma [deg]": float(np.degrees(self.estimate.yaw_sigma.max()))}
+            values |= {
+                'consistency': float(self.estimate.consistency),
+                'yaw sigma [deg]': float(np.degrees(self.estimate.yaw_sigma.max())),
+            }
         if faults:
-            return ERROR, values["faults"], values
+            return ERROR, values['faults'], values
         if self.estimate is None:
             return WARN, self.estimator.message or status, values
-        return OK, "tracking", values
+        return OK, 'tracking', values
 
     def summary(self) -> dict[str, Any]:
         """Adds the estimator's own counts."""
-        return super().summary() | {"estimator": dict(self.estimator.counts)}
+        return super().summary() | {'estimator': dict(self.estimator.counts)}
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.in_worker(self._start_over)
-        response.success, response.message = True, "taring anew: keep the robot at rest"
+        response.success, response.message = True, 'taring anew: keep the robot at rest'
         return response
 
     def _start_over(self) -> None:
@@ -97,5 +105,5 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(run(ShapeNode, args))
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+import sys
+import threading
+import time
 from typing import Any
 
 from continuum_loc.measurements import (
@@ -21,15 +21,21 @@ from continuum_loc.measurements import (
 )
 from continuum_loc.nodes.pacing import Paced
 from continuum_loc.nodes.parameters import guard, live_fields, read
-from continuum_loc.nodes.runtime import Delays, PackageNode, output_qos, run, write_summary
+from continuum_loc.nodes.runtime import Delays, output_qos, PackageNode, run, write_summary
 from continuum_loc.nodes.settings import SimulatorNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
-from msg_tools.topics import TRACKER, topic_spec
+from msg_tools.topics import topic_spec, TRACKER
 
-TOPIC_OF = {TofFrame: "tof/points", ImuSample: "imu/data_raw", FieldSample: "imu/mag", StrainSample: "strain",
-            EncoderSample: "joint_states", TruthSample: "ground_truth/poses"}
+TOPIC_OF = {
+    TofFrame: 'tof/points',
+    ImuSample: 'imu/data_raw',
+    FieldSample: 'imu/mag',
+    StrainSample: 'strain',
+    EncoderSample: 'joint_states',
+    TruthSample: 'ground_truth/poses',
+}
 SETTLED_MATCH = 0.5  # s after discovery says that all is matched until the data begins
 
 
@@ -37,7 +43,7 @@ class SimulatorNode(PackageNode):
     """Paces `World.run` to the wall clock and stamps with the node's clock."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("simulator", SimulatorNodeSettings(), **options)
+        super().__init__('simulator', SimulatorNodeSettings(), **options)
         self.check_parameters()
         guard(self, self._change)
         self.robot = load_robot(self.settings.robot)
@@ -45,22 +51,28 @@ class SimulatorNode(PackageNode):
         self.published: Counter[str] = Counter()
         self.delays = Delays()
         self.outputs = {topic: self._publisher(topic) for topic in self._topics()}
-        self._diagnostics = self._publisher("/diagnostics")
-        self._state = "preparing"
+        self._diagnostics = self._publisher('/diagnostics')
+        self._state = 'preparing'
         self._failure: BaseException | None = None
         self._paced = Paced(self._stamped(), self.settings.lookahead)
         self._shift: int | None = None
-        self._thread = threading.Thread(target=self._simulate, name="simulation", daemon=True)
+        self._thread = threading.Thread(target=self._simulate, name='simulation', daemon=True)
         self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
 
     def close(self) -> None:
         """Stop the simulation and write the summary; raise what ended the simulation, if anything did."""
         self._paced.stop()
-        self._state = self._state if self._state == "finished" else "stopped"
+        self._state = self._state if self._state == 'finished' else 'stopped'
         self._thread.join(timeout=10.0)
-        write_summary(self.settings.summary_file, {"published": dict(self.published), "state": self._state,
-                                                   "delay_ms": self.delays.statistics()})
+        write_summary(
+            self.settings.summary_file,
+            {
+                'published': dict(self.published),
+                'state': self._state,
+                'delay_ms': self.delays.statistics(),
+            },
+        )
         if self._failure is not None:
             raise self._failure
 
@@ -69,14 +81,29 @@ class SimulatorNode(PackageNode):
         from continuum_loc.simulator.world import World
 
         s = self.settings
-        scene = None if s.scene == "none" else load_scene(s.scene)
-        return World(self.robot, scene, s.trajectory, plant=s.plant or None, profile=s.profile,
-                     tof_fidelity=s.tof_fidelity, seed=s.seed)
+        scene = None if s.scene == 'none' else load_scene(s.scene)
+        return World(
+            self.robot,
+            scene,
+            s.trajectory,
+            plant=s.plant or None,
+            profile=s.profile,
+            tof_fidelity=s.tof_fidelity,
+            seed=s.seed,
+        )
 
     def _topics(self) -> list[str]:
-        kinds = {"tof/points": self.robot.tof, "imu/data_raw": self.robot.imu, "imu/mag": self.robot.hall,
-                 "strain": self.robot.strain, "joint_states": True, "ground_truth/poses": True}
-        return [topic for topic, present in kinds.items() if present] + [TRACKER + t.name for t in self.robot.trackers]
+        kinds = {
+            'tof/points': self.robot.tof,
+            'imu/data_raw': self.robot.imu,
+            'imu/mag': self.robot.hall,
+            'strain': self.robot.strain,
+            'joint_states': True,
+            'ground_truth/poses': True,
+        }
+        return [topic for topic, present in kinds.items() if present] + [
+            TRACKER + t.name for t in self.robot.trackers
+        ]
 
     def _publisher(self, topic: str) -> Any:
         spec = topic_spec(topic)
@@ -91,23 +118,25 @@ class SimulatorNode(PackageNode):
     def _simulate(self) -> None:
         try:
             if self._wait_for_listeners():
-                self._state = "running"
+                self._state = 'running'
                 self._paced.run(self._deliver, self._begin)
-                self._state = "finished"
+                self._state = 'finished'
         except BaseException as error:
             if self.context.ok():
                 self._failure = error
         self.finish()
 
     def _wait_for_listeners(self) -> bool:
-        sensors = self.outputs["tof/points" if self.robot.tof else "imu/data_raw"]
+        sensors = self.outputs['tof/points' if self.robot.tof else 'imu/data_raw']
         deadline = time.monotonic() + self.settings.wait_timeout
         while sensors.get_subscription_count() < self.settings.wait_for:
-            if self._state == "stopped":
+            if self._state == 'stopped':
                 return False
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{sensors.get_subscription_count()} of {self.settings.wait_for} subscriptions "
-                                   f"listen to {sensors.topic_name} after {self.settings.wait_timeout:g} s")
+                raise TimeoutError(
+                    f'{sensors.get_subscription_count()} of {self.settings.wait_for} subscriptions '
+                    f'listen to {sensors.topic_name} after {self.settings.wait_timeout:g} s'
+                )
             time.sleep(0.02)
         if self.settings.wait_for:
             time.sleep(SETTLED_MATCH)
@@ -116,14 +145,16 @@ class SimulatorNode(PackageNode):
     def _begin(self, first: int) -> None:
         """The first sample is due one lookahead from now: from there, data time is the node's clock."""
         self._shift = self.now() + round(self.settings.lookahead * 1e9) - first
-        self.get_logger().info("data begins")
+        self.get_logger().info('data begins')
 
     def _deliver(self, stamp: int, sample: Any, delay: float) -> None:
-        topic = TRACKER + sample.sensor if isinstance(sample, TrackedPose) else TOPIC_OF[type(sample)]
-        if topic == "ground_truth/poses" and not self.settings.publish_truth:
+        topic = (
+            TRACKER + sample.sensor if isinstance(sample, TrackedPose) else TOPIC_OF[type(sample)]
+        )
+        if topic == 'ground_truth/poses' and not self.settings.publish_truth:
             return
         sample = replace(sample, stamp=stamp + self._shift)
-        if self.settings.frame_prefix and hasattr(sample, "sensor"):
+        if self.settings.frame_prefix and hasattr(sample, 'sensor'):
             sample = replace(sample, sensor=self.settings.frame_prefix + sample.sensor)
         self.outputs[topic].publish(topic_spec(topic).encode(ros_messages(), sample))
         self.published[topic] += 1
@@ -141,12 +172,15 @@ class SimulatorNode(PackageNode):
     def _publish_diagnostics(self) -> None:
         recent = self.delays.recent(500)
         worst = float(recent.max()) if len(recent) else 0.0
-        behind = self._state == "running" and worst > self.settings.behind_warning
-        text = f"{1e3 * worst:.0f} ms behind the clock" if behind else self._state
-        values = {"published": str(sum(self.published.values())), "worst recent delay [ms]": f"{1e3 * worst:.1f}"}
-        name = f"{self.get_fully_qualified_name()}: {self.robot.name}"
+        behind = self._state == 'running' and worst > self.settings.behind_warning
+        text = f'{1e3 * worst:.0f} ms behind the clock' if behind else self._state
+        values = {
+            'published': str(sum(self.published.values())),
+            'worst recent delay [ms]': f'{1e3 * worst:.1f}',
+        }
+        name = f'{self.get_fully_qualified_name()}: {self.robot.name}'
         record = DiagnosticsRecord(self.now(), ((name, 1 if behind else 0, text, values),))
-        self._diagnostics.publish(topic_spec("/diagnostics").encode(ros_messages(), record))
+        self._diagnostics.publish(topic_spec('/diagnostics').encode(ros_messages(), record))
 
 
 def main(args: list[str] | None = None) -> None:
@@ -154,5 +188,5 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(run(SimulatorNode, args))
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

@@ -2,49 +2,55 @@
 
 from __future__ import annotations
 
-import json
-import sys
-import threading
 from collections.abc import Callable
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import json
 from pathlib import Path
+import sys
+import threading
 from typing import Any
 
-import numpy as np
-from rclpy.qos import DurabilityPolicy
-
-from continuum_loc.nodes.runtime import PackageNode, input_qos, run
+from continuum_loc.nodes.runtime import input_qos, PackageNode, run
 from continuum_loc.nodes.settings import ViewerNodeSettings
 from continuum_loc.settings import SettingsError
 from msg_tools.errors import ConvertError
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord
 from msg_tools.topics import topic_spec
+import numpy as np
+from rclpy.qos import DurabilityPolicy
 
-SHOWN = {"poses": "rings", "shape/poses": "rings", "backbone": "backbone", "shape/curve": "backbone",
-         "ground_truth/poses": "truth", "reconstruction": "reconstruction", "prior_map": "map"}
-PAGE = Path(__file__).parent / "viewer.html"
-NOTHING = {"x": [], "y": [], "z": []}
+SHOWN = {
+    'poses': 'rings',
+    'shape/poses': 'rings',
+    'backbone': 'backbone',
+    'shape/curve': 'backbone',
+    'ground_truth/poses': 'truth',
+    'reconstruction': 'reconstruction',
+    'prior_map': 'map',
+}
+PAGE = Path(__file__).parent / 'viewer.html'
+NOTHING = {'x': [], 'y': [], 'z': []}
 
 
 class ViewerNode(PackageNode):
     """Keeps the newest of everything and serves it; the page asks five times a second."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("viewer", ViewerNodeSettings(), **options)
+        super().__init__('viewer', ViewerNodeSettings(), **options)
         self.check_parameters()
-        self.newest = {name: NOTHING for name in SHOWN.values()}
+        self.newest = dict.fromkeys(SHOWN.values(), NOTHING)
         self.status: dict[str, tuple[int, str]] = {}
         self.map_version = 0
         self.server = self._serve()
-        for topic in (*SHOWN, "/diagnostics"):
+        for topic in (*SHOWN, '/diagnostics'):
             spec = topic_spec(topic)
             qos = input_qos(spec, spec.latched)
             if spec.latched:
                 qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
             self.listen(spec.type, topic, partial(self._receive, topic), qos)
         host, port = self.server.server_address[:2]
-        self.get_logger().info(f"watch at http://{host}:{port}/")
+        self.get_logger().info(f'watch at http://{host}:{port}/')
 
     def close(self) -> None:
         """Stop serving."""
@@ -53,8 +59,11 @@ class ViewerNode(PackageNode):
 
     def state(self) -> dict[str, Any]:
         """What the page shows, without the map."""
-        shown = {name: points for name, points in self.newest.items() if name != "map"}
-        return shown | {"status": [self.status[name] for name in sorted(self.status)], "map_version": self.map_version}
+        shown = {name: points for name, points in self.newest.items() if name != 'map'}
+        return shown | {
+            'status': [self.status[name] for name in sorted(self.status)],
+            'map_version': self.map_version,
+        }
 
     def _receive(self, topic: str, message: Any) -> None:
         try:
@@ -63,32 +72,49 @@ class ViewerNode(PackageNode):
             self.get_logger().warning(str(error), throttle_duration_sec=10.0)
             return
         if isinstance(item, DiagnosticsRecord):
-            self.status |= {name: (level, f"{name}: {text}") for name, level, text, _ in item.statuses}
+            self.status |= {
+                name: (level, f'{name}: {text}') for name, level, text, _ in item.statuses
+            }
             return
         self.newest[SHOWN[topic]] = self._columns(topic, item)
-        self.map_version += topic == "prior_map"
+        self.map_version += topic == 'prior_map'
 
     def _columns(self, topic: str, item: Any) -> dict[str, list[float]]:
         if isinstance(item, CloudRecord):
-            most = self.settings.map_points if topic == "prior_map" else self.settings.cloud_points
+            most = self.settings.map_points if topic == 'prior_map' else self.settings.cloud_points
             points = item.points[:: max(1, -(-len(item.points) // max(most, 1)))][:most]
         else:
-            T = item.T_map_backbone if isinstance(item, PathRecord) else getattr(item, "T_map_body", None)
+            T = (
+                item.T_map_backbone
+                if isinstance(item, PathRecord)
+                else getattr(item, 'T_map_body', None)
+            )
             points = (item.T_map_ring if T is None else T)[:, :3, 3]
-        return dict(zip("xyz", np.round(points.T, 4).tolist(), strict=True)) if len(points) else NOTHING
+        return (
+            dict(zip('xyz', np.round(points.T, 4).tolist(), strict=True))
+            if len(points)
+            else NOTHING
+        )
 
     def _serve(self) -> ThreadingHTTPServer:
         from plotly.offline import get_plotlyjs
 
-        answers = {"/": ("text/html", PAGE.read_bytes), "/plotly.js": ("text/javascript", get_plotlyjs().encode),
-                   "/state.json": ("application/json", lambda: json.dumps(self.state()).encode()),
-                   "/map.json": ("application/json", lambda: json.dumps(self.newest["map"]).encode())}
+        answers = {
+            '/': ('text/html', PAGE.read_bytes),
+            '/plotly.js': ('text/javascript', get_plotlyjs().encode),
+            '/state.json': ('application/json', lambda: json.dumps(self.state()).encode()),
+            '/map.json': ('application/json', lambda: json.dumps(self.newest['map']).encode()),
+        }
         try:
-            server = ThreadingHTTPServer((self.settings.host, self.settings.port), partial(_Handler, answers))
+            server = ThreadingHTTPServer(
+                (self.settings.host, self.settings.port), partial(_Handler, answers)
+            )
         except OSError as error:
-            raise SettingsError(f"cannot serve on {self.settings.host}:{self.settings.port} ({error.strerror}); "
-                                "choose another `port`, or 0 for a free one") from None
-        threading.Thread(target=server.serve_forever, name="http", daemon=True).start()
+            raise SettingsError(
+                f'cannot serve on {self.settings.host}:{self.settings.port} ({error.strerror}); '
+                'choose another `port`, or 0 for a free one'
+            ) from None
+        threading.Thread(target=server.serve_forever, name='http', daemon=True).start()
         return server
 
 
@@ -98,14 +124,14 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*args)
 
     def do_GET(self) -> None:
-        kind, content = self.answers.get(self.path, ("", None))
+        kind, content = self.answers.get(self.path, ('', None))
         if content is None:
             self.send_error(404)
             return
         body = content()
         self.send_response(200)
-        self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
+        self.send_header('Content-Type', f'{kind}; charset=utf-8')
+        self.send_header('Content-Length', str(len(body)))
         self.end_headers()
         self.wfile.write(body)
 
@@ -118,5 +144,5 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(run(ViewerNode, args))
 
 
-if __name__ == "__main__":
+if __name__ == '__main__':
     main()

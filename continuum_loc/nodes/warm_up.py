@@ -5,34 +5,37 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
 from continuum_loc.measurements import (
-    NANOSECONDS,
-    TOF_VALID,
     EncoderSample,
     FieldSample,
     ImuSample,
     Measurement,
-    StrainSample,
-    TofFrame,
+    NANOSECONDS,
     nanoseconds,
+    StrainSample,
+    TOF_VALID,
+    TofFrame,
 )
 from continuum_loc.robot import RobotDescription
+import numpy as np
 
 NOISE = 1e-4  # m, rad/s
 
 
-def rest_samples(robot: RobotDescription, duration: float, start: int = NANOSECONDS) -> Iterator[Measurement]:
-    """Samples in order of their stamps of a straight robot that rests in a tube of 0.5 m, with a little seeded noise:
-    a sensor that repeats itself to the last bit is refused as frozen."""
+def rest_samples(
+    robot: RobotDescription, duration: float, start: int = NANOSECONDS
+) -> Iterator[Measurement]:
+    """
+    Samples in order of their stamps of a straight robot that rests in a tube of 0.5 m, with a
+    little seeded noise: a sensor that repeats itself to the last bit is refused as frozen.
+    """
     rng = np.random.default_rng(0)
     tick = 1.0 / max(robot.imu_model.rate, 1.0)
     for step in range(round(duration / tick)):
         stamp = start + nanoseconds(step * tick)
         yield from _inertial(robot, stamp, rng)
-        if robot.base.insertion.mode == "measured":
-            yield EncoderSample(stamp, ("insertion",), np.zeros(1), np.zeros(1))
+        if robot.base.insertion.mode == 'measured':
+            yield EncoderSample(stamp, ('insertion',), np.zeros(1), np.zeros(1))
         if _due(step, tick, robot.strain.rate if robot.strain else 0.0):
             s = robot.strain_stations
             yield StrainSample(stamp, s, np.zeros_like(s), np.zeros_like(s))
@@ -41,7 +44,9 @@ def rest_samples(robot: RobotDescription, duration: float, start: int = NANOSECO
 
 
 def warm_up(filter_: Any, robot: RobotDescription, window: float) -> None:
-    """Compile every kernel that `filter_` uses by running it past its first marginalisation, then reset it.
+    """
+    Compile every kernel that `filter_` uses by running it past its first marginalisation, then
+    reset it.
 
     The tube is not what the map shows, so that the search for a lost body runs, and compiles, too.
     """
@@ -55,7 +60,9 @@ def _due(step: int, tick: float, rate: float) -> bool:
     return int((step + 1) * tick * rate + 1e-9) > int(step * tick * rate + 1e-9)
 
 
-def _inertial(robot: RobotDescription, stamp: int, rng: np.random.Generator) -> Iterator[Measurement]:
+def _inertial(
+    robot: RobotDescription, stamp: int, rng: np.random.Generator
+) -> Iterator[Measurement]:
     for sensor in robot.imu:
         yield ImuSample(stamp, sensor.name, NOISE * rng.normal(size=3), np.array([0.0, 0.0, 9.81]))
     for sensor in robot.hall:
@@ -66,5 +73,11 @@ def _frames(robot: RobotDescription, stamp: int, rng: np.random.Generator) -> It
     rays = robot.tof_model.directions
     for sensor in robot.tof:
         ranges = 0.5 + NOISE * rng.normal(size=len(rays))
-        yield TofFrame(stamp, sensor.name, ranges[:, None] * rays, ranges, robot.tof_model.sigma(ranges),
-                       np.full(len(rays), TOF_VALID, np.uint8))
+        yield TofFrame(
+            stamp,
+            sensor.name,
+            ranges[:, None] * rays,
+            ranges,
+            robot.tof_model.sigma(ranges),
+            np.full(len(rays), TOF_VALID, np.uint8),
+        )

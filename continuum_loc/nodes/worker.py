@@ -1,36 +1,38 @@
-"""A node that estimates: callbacks only buffer, and one worker thread does everything else.
+"""
+A node that estimates: callbacks only buffer, and one worker thread does everything else.
 
-Reception is a single-threaded executor, so that a slow step never blocks it; what an overloaded worker leaves
-behind is dropped by `Inbox` in its defined order, counted, and told on /diagnostics.
+Reception is a single-threaded executor, so that a slow step never blocks it; what an overloaded
+worker leaves behind is dropped by `Inbox` in its defined order, counted, and told on /diagnostics.
 """
 
 from __future__ import annotations
 
-import threading
-import time
-import traceback
 from collections.abc import Callable
 from functools import partial
 from queue import SimpleQueue
+import threading
+import time
+import traceback
 from typing import Any
 
-import numpy as np
-
-from continuum_loc.measurements import NANOSECONDS, Measurement
+from continuum_loc.measurements import Measurement, NANOSECONDS
 from continuum_loc.nodes.intake import Inbox, Intake, Queued
 from continuum_loc.nodes.parameters import guard, live_fields, read
-from continuum_loc.nodes.runtime import Delays, PackageNode, input_qos, output_qos, write_summary
+from continuum_loc.nodes.runtime import Delays, input_qos, output_qos, PackageNode, write_summary
 from continuum_loc.nodes.settings import IntakeSettings
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import Settings
 from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
-from msg_tools.topics import TRACKER, topic_spec
+from msg_tools.topics import topic_spec, TRACKER
+import numpy as np
 
 OK, WARN, ERROR, STALE = range(4)
 POLL = 0.1  # s; how often an idle worker looks whether it has to stop
 STALE_AFTER = 2.0  # s without data
-PLAUSIBLE_LATENCY = 30.0  # s; older stamps come from a bag played without its clock, and say nothing about latency
+PLAUSIBLE_LATENCY = (
+    30.0  # s; older stamps come from a bag played without its clock, and say nothing about latency
+)
 
 
 class WorkerNode(PackageNode):
@@ -42,7 +44,9 @@ class WorkerNode(PackageNode):
         super().__init__(name, defaults, **options)
         self.robot = load_robot(self.settings.robot)
         self.inbox = Inbox(self.settings.intake)
-        self.intake = Intake(self.robot, self.settings.intake, self._report, self.settings.frame_prefix)
+        self.intake = Intake(
+            self.robot, self.settings.intake, self._report, self.settings.frame_prefix
+        )
         self.latency, self.lag, self.step = Delays(), Delays(), Delays()
         self.failures = 0
         self.outputs: dict[str, Any] = {}
@@ -50,7 +54,7 @@ class WorkerNode(PackageNode):
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._received_at = 0.0
         self._told: dict[str, int] = {}
-        self._thread = threading.Thread(target=self._work, name=f"{name} worker", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=f'{name} worker', daemon=True)
 
     # ------------------------------------------------ for subclasses
 
@@ -68,8 +72,13 @@ class WorkerNode(PackageNode):
 
     def summary(self) -> dict[str, Any]:
         """What the summary file holds."""
-        return {"counts": self.counts(), "latency_ms": self.latency.statistics(), "lag_ms": self.lag.statistics(),
-                "step_ms": self.step.statistics(), "latencies_s": list(self.latency.values)}
+        return {
+            'counts': self.counts(),
+            'latency_ms': self.latency.statistics(),
+            'lag_ms': self.lag.statistics(),
+            'step_ms': self.step.statistics(),
+            'latencies_s': list(self.latency.values),
+        }
 
     # ------------------------------------------------ life
 
@@ -79,8 +88,12 @@ class WorkerNode(PackageNode):
         guard(self, self._change)
         for topic in self._input_topics():
             spec = topic_spec(topic)
-            self.listen(spec.type, topic, partial(self._receive, topic),
-                        input_qos(spec, self.settings.intake.reliable_inputs))
+            self.listen(
+                spec.type,
+                topic,
+                partial(self._receive, topic),
+                input_qos(spec, self.settings.intake.reliable_inputs),
+            )
         self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
         self.get_logger().info(f"ready: robot '{self.robot.name}'")
@@ -94,9 +107,14 @@ class WorkerNode(PackageNode):
 
     def counts(self) -> dict[str, Any]:
         """What was received, used, refused (by class of error) and dropped (by topic) before the estimator."""
-        return {"received": dict(self.inbox.received), "used": dict(self.intake.used),
-                "refused": dict(self.intake.refused), "dropped": dict(self.inbox.dropped),
-                "restarts": self.intake.gate.restarts, "failures": self.failures}
+        return {
+            'received': dict(self.inbox.received),
+            'used': dict(self.intake.used),
+            'refused': dict(self.intake.refused),
+            'dropped': dict(self.inbox.dropped),
+            'restarts': self.intake.gate.restarts,
+            'failures': self.failures,
+        }
 
     def in_worker(self, task: Callable[[], None]) -> None:
         """Have the worker do `task` before its next message (services and parameters ask from other threads)."""
@@ -115,13 +133,19 @@ class WorkerNode(PackageNode):
         """The publisher of a topic of the contract."""
         if topic not in self.outputs:
             spec = topic_spec(topic)
-            self.outputs[topic] = self.create_publisher(ros_messages().resolve(spec.type), topic, output_qos(spec))
+            self.outputs[topic] = self.create_publisher(
+                ros_messages().resolve(spec.type), topic, output_qos(spec)
+            )
         return self.outputs[topic]
 
     # ------------------------------------------------ reception (executor thread)
 
     def _input_topics(self) -> list[str]:
-        trackers = [TRACKER + sensor.name for sensor in self.robot.trackers] if TRACKER in self.inputs else []
+        trackers = (
+            [TRACKER + sensor.name for sensor in self.robot.trackers]
+            if TRACKER in self.inputs
+            else []
+        )
         return [topic for topic in self.inputs if topic != TRACKER] + trackers
 
     def _receive(self, topic: str, message: Any) -> None:
@@ -140,7 +164,7 @@ class WorkerNode(PackageNode):
                     self._handle(queued)
         except Exception:
             if self.context.ok() and not self._stop.is_set():
-                self.get_logger().fatal(f"the worker failed:\n{traceback.format_exc()}")
+                self.get_logger().fatal(f'the worker failed:\n{traceback.format_exc()}')
                 self.failures += 1
             self.finish()
 
@@ -148,7 +172,9 @@ class WorkerNode(PackageNode):
         restarts = self.intake.gate.restarts
         measurement = self.intake.accept(queued.topic, queued.message, queued.arrival, self.now())
         if self.intake.gate.restarts != restarts:
-            self.get_logger().warning("time went backward: the data starts again, and so does the estimate")
+            self.get_logger().warning(
+                'time went backward: the data starts again, and so does the estimate'
+            )
             self.restart()
         if measurement is None:
             return
@@ -157,8 +183,11 @@ class WorkerNode(PackageNode):
             stamp = self.consume(measurement)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
             self.failures += 1
-            self.intake.refuse("failure", f"the estimator failed on {queued.topic} ({type(error).__name__}: {error}) "
-                               "and starts anew")
+            self.intake.refuse(
+                'failure',
+                f'the estimator failed on {queued.topic} ({type(error).__name__}: {error}) '
+                'and starts anew',
+            )
             self.restart()
             return
         if stamp is not None:
@@ -174,12 +203,16 @@ class WorkerNode(PackageNode):
     # ------------------------------------------------ parameters, diagnostics
 
     def _change(self, values: dict[str, Any]) -> str | None:
-        live = live_fields(type(self.settings)) | {f"intake.{name}" for name in live_fields(IntakeSettings)}
+        live = live_fields(type(self.settings)) | {
+            f'intake.{name}' for name in live_fields(IntakeSettings)
+        }
         fixed = sorted(set(values) - live)
         if fixed:
             return f"'{fixed[0]}' is fixed while the node runs: set it when you start it"
         self.settings = read(self, type(self.settings), changed=values)
-        self.inbox.settings = self.intake.settings = self.intake.gate.settings = self.settings.intake
+        self.inbox.settings = self.intake.settings = self.intake.gate.settings = (
+            self.settings.intake
+        )
         return None
 
     def _report(self, kind: str, text: str) -> None:
@@ -189,28 +222,47 @@ class WorkerNode(PackageNode):
         level, text, values = self.describe()
         for check in (self._check_losses, self._check_lag, self._check_silence):
             level, text = max((level, text), check(), key=lambda pair: pair[0])
-        values = {"received": sum(self.inbox.received.values()), "used": sum(self.intake.used.values()),
-                  "refused": dict(self.intake.refused), "dropped": dict(self.inbox.dropped), "queue": len(self.inbox),
-                  **values}
-        shown = {key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in values.items()}
-        name = f"{self.get_fully_qualified_name()}: {self.robot.name}"
-        self.publish("/diagnostics", DiagnosticsRecord(self.now(), ((name, level, text, shown),)))
+        values = {
+            'received': sum(self.inbox.received.values()),
+            'used': sum(self.intake.used.values()),
+            'refused': dict(self.intake.refused),
+            'dropped': dict(self.inbox.dropped),
+            'queue': len(self.inbox),
+            **values,
+        }
+        shown = {
+            key: f'{value:.4g}' if isinstance(value, float) else str(value)
+            for key, value in values.items()
+        }
+        name = f'{self.get_fully_qualified_name()}: {self.robot.name}'
+        self.publish('/diagnostics', DiagnosticsRecord(self.now(), ((name, level, text, shown),)))
 
     def _check_losses(self) -> tuple[int, str]:
-        lost = {"dropped": sum(self.inbox.dropped.values()), "refused": sum(self.intake.refused.values()),
-                "failures": self.failures}
-        new = {key: count - self._told.get(key, 0) for key, count in lost.items() if count > self._told.get(key, 0)}
+        lost = {
+            'dropped': sum(self.inbox.dropped.values()),
+            'refused': sum(self.intake.refused.values()),
+            'failures': self.failures,
+        }
+        new = {
+            key: count - self._told.get(key, 0)
+            for key, count in lost.items()
+            if count > self._told.get(key, 0)
+        }
         self._told = lost
-        return (WARN, "messages " + ", ".join(f"{key}: {count}" for key, count in new.items())) if new else (OK, "")
+        return (
+            (WARN, 'messages ' + ', '.join(f'{key}: {count}' for key, count in new.items()))
+            if new
+            else (OK, '')
+        )
 
     def _check_lag(self) -> tuple[int, str]:
         recent = self.lag.recent(10)
         if len(recent) and float(np.median(recent)) > self.settings.lag_warning:
-            return WARN, f"lagging {1e3 * float(np.median(recent)):.0f} ms behind reception"
-        return OK, ""
+            return WARN, f'lagging {1e3 * float(np.median(recent)):.0f} ms behind reception'
+        return OK, ''
 
     def _check_silence(self) -> tuple[int, str]:
         if self._received_at == 0.0:
-            return WARN, "no data yet"
+            return WARN, 'no data yet'
         silent = time.monotonic() - self._received_at
-        return (ERROR, f"no data for {silent:.1f} s") if silent > STALE_AFTER else (OK, "")
+        return (ERROR, f'no data for {silent:.1f} s') if silent > STALE_AFTER else (OK, '')

@@ -1,5 +1,10 @@
 """The shape of a continuum robot from Hall sensors and IMUs (start with `estimator`)."""
 
-from continuum_loc.shape.estimator import ShapeEstimate, ShapeEstimator, ShapeSettings, load_shape_settings
+from continuum_loc.shape.estimator import (
+    load_shape_settings,
+    ShapeEstimate,
+    ShapeEstimator,
+    ShapeSettings,
+)
 
-__all__ = ["ShapeEstimate", "ShapeEstimator", "ShapeSettings", "load_shape_settings"]
+__all__ = ['ShapeEstimate', 'ShapeEstimator', 'ShapeSettings', 'load_shape_settings']

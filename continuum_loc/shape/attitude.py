@@ -1,26 +1,27 @@
-"""Attitude of a module from its IMU.
+"""
+Attitude of a module from its IMU.
 
-`GravityFilter` integrates the gyro on SO(3) and lets the accelerometer correct tilt alone: the correction turns
-about an axis that is level, so yaw is what the gyro makes of the starting value. Gravity says nothing about
-yaw; its growing uncertainty is part of the covariance.
+`GravityFilter` integrates the gyro on SO(3) and lets the accelerometer correct tilt alone: the
+correction turns about an axis that is level, so yaw is what the gyro makes of the starting value.
+Gravity says nothing about yaw; its growing uncertainty is part of the covariance.
 
 `EulerFilter` is the paper's form (eqs. 3-6) for comparison, with its printed faults as switches.
 
-Both read samples in the IMU's own frame; `map` has z up, and a resting accelerometer reads +g upwards.
+Both read samples in the IMU's own frame; `map` has z up, and a resting accelerometer reads +g
+upwards.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-
-import numpy as np
-from numba import njit
-from pydantic import Field
-from scipy.spatial.transform import Rotation
+import math
 
 from continuum_loc.measurements import seconds
 from continuum_loc.settings import Settings
+from numba import njit
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 GRAVITY = 9.81  # m/s^2
 
@@ -28,9 +29,13 @@ GRAVITY = 9.81  # m/s^2
 class AttitudeSettings(Settings):
     """Complementary filter of gyro and accelerometer."""
 
-    time_constant: float = Field(1.0, gt=0.0, description="how slowly gravity corrects tilt [s]")
-    gate: float = Field(0.4, gt=0.0, description="no correction while |a| departs from g by more [m/s^2]")
-    bias_sigma: float = Field(1e-4, ge=0.0, description="what the rest average leaves of the gyro bias [rad/s]")
+    time_constant: float = Field(1.0, gt=0.0, description='how slowly gravity corrects tilt [s]')
+    gate: float = Field(
+        0.4, gt=0.0, description='no correction while |a| departs from g by more [m/s^2]'
+    )
+    bias_sigma: float = Field(
+        1e-4, ge=0.0, description='what the rest average leaves of the gyro bias [rad/s]'
+    )
 
 
 class GravityFilter:
@@ -41,7 +46,9 @@ class GravityFilter:
         self.R_map_imu: np.ndarray | None = None
         self.gated = 0
 
-    def start(self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0) -> None:
+    def start(
+        self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0
+    ) -> None:
         """Begin at a known rotation with a gyro bias (3,) [rad/s]. Tilt is soon the accelerometer's own."""
         self.R_map_imu = np.array(R_map_imu, dtype=float)
         self.bias = np.array(bias, dtype=float)
@@ -54,7 +61,9 @@ class GravityFilter:
         gain = 1.0 - math.exp(-dt / self.settings.time_constant)
         rate = gyro - self.bias
         # The mean of the rates at both ends integrates a smooth motion to second order.
-        used = _turn_and_level(self.R_map_imu, 0.5 * (rate + self.rate), accel, dt, gain, self.settings.gate)
+        used = _turn_and_level(
+            self.R_map_imu, 0.5 * (rate + self.rate), accel, dt, gain, self.settings.gate
+        )
         self.gated += not used
         self.stamp, self.rate, self._period = stamp, rate, dt
         return self.R_map_imu
@@ -78,7 +87,9 @@ class GravityFilter:
         """Standard deviation of either tilt angle [rad] in the steady state of the filter."""
         tau = self.settings.time_constant
         gravity = (self._accel_sigma / GRAVITY) ** 2 * self._period / (2.0 * tau)
-        gyro = self._gyro_sigma**2 * self._period * tau / 2.0 + (self.settings.bias_sigma * tau) ** 2
+        gyro = (
+            self._gyro_sigma**2 * self._period * tau / 2.0 + (self.settings.bias_sigma * tau) ** 2
+        )
         return math.sqrt(gravity + gyro)
 
     @property
@@ -94,7 +105,8 @@ def _turn_and_level(R, rate, accel, dt, gain, gate):
     size = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
     if not abs(size - GRAVITY) <= gate:
         return False
-    # Measured x predicted 'up', both in the IMU's frame: the turn that brings one onto the other, and level.
+    # Measured x predicted 'up', both in the IMU's frame: the turn that brings one onto the other,
+    # and level.
     ax, ay, az = accel[0] / size, accel[1] / size, accel[2] / size
     ux, uy, uz = R[2, 0], R[2, 1], R[2, 2]
     cx, cy, cz = ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux
@@ -127,15 +139,18 @@ def level(R_map_imu: np.ndarray, accel: np.ndarray) -> np.ndarray:
 
 @dataclass
 class EulerFilter:
-    """Roll theta, pitch phi and yaw psi of one IMU by the paper's eqs. 3-6 [rad].
+    """
+    Roll theta, pitch phi and yaw psi of one IMU by the paper's eqs. 3-6 [rad].
 
-    With the defaults the convention is R_map_imu = Rz(psi) Ry(phi) Rx(theta), and a resting accelerometer
-    reads g (-sin phi, sin theta cos phi, cos theta cos phi). The printed forms depart from it:
+    With the defaults the convention is R_map_imu = Rz(psi) Ry(phi) Rx(theta), and a resting
+    accelerometer reads g (-sin phi, sin theta cos phi, cos theta cos phi). The printed forms
+    depart from it:
 
-    pitch_as_printed: eq. 3 has +a_x, the other sign. quadrant_as_printed: eq. 3 has arctan(a_y / a_z), which
-    folds beyond 90 degrees. swap_as_printed: eq. 6 builds the quaternion with roll and pitch exchanged.
-    yaw_as_printed: eq. 5 blends yaw with psi_acc, which is undefined; 0 makes real yaw decay to nothing.
-    The rates of eq. 4 are singular at 90 degrees of pitch in any case.
+    pitch_as_printed: eq. 3 has +a_x, the other sign. quadrant_as_printed: eq. 3 has arctan(a_y /
+    a_z), which folds beyond 90 degrees. swap_as_printed: eq. 6 builds the quaternion with roll and
+    pitch exchanged.
+    yaw_as_printed: eq. 5 blends yaw with psi_acc, which is undefined; 0 makes real yaw decay to
+    nothing. The rates of eq. 4 are singular at 90 degrees of pitch in any case.
     """
 
     alpha: float = 0.2
@@ -146,16 +161,18 @@ class EulerFilter:
     angles: np.ndarray | None = None
     stamp: int = 0
     bias: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    # Eqs. 3-6 state no uncertainty. What `ShapeEstimator` reads of a filter is then: always moving, a degree of
-    # error, and a yaw that nobody knows.
+    # Eqs. 3-6 state no uncertainty. What `ShapeEstimator` reads of a filter is then: always
+    # moving, a degree of error, and a yaw that nobody knows.
     rate: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
     covariance: np.ndarray = field(default_factory=lambda: np.radians(1.0) ** 2 * np.eye(3))
     yaw_sigma: float = math.inf
 
-    def start(self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0) -> None:
+    def start(
+        self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0
+    ) -> None:
         """Begin at a known rotation with a gyro bias (3,) [rad/s], instead of at the first sample with yaw 0."""
         self.stamp, self.bias = stamp, np.array(bias, dtype=float)
-        self.angles = Rotation.from_matrix(R_map_imu).as_euler("ZYX")[::-1].copy()
+        self.angles = Rotation.from_matrix(R_map_imu).as_euler('ZYX')[::-1].copy()
 
     def rotation_at(self, stamp: int) -> np.ndarray:
         """The rotation of the last sample."""
@@ -167,7 +184,9 @@ class EulerFilter:
         if self.angles is None:
             self.angles = np.array([roll, pitch, 0.0])
         else:
-            carried = self.angles + euler_rates(self.angles, gyro - self.bias) * seconds(stamp, self.stamp)
+            carried = self.angles + euler_rates(self.angles, gyro - self.bias) * seconds(
+                stamp, self.stamp
+            )
             measured = np.array([roll, pitch, 0.0 if self.yaw_as_printed else carried[2]])
             # Angles blend along the shorter way round.
             difference = (measured - carried + math.pi) % (2.0 * math.pi) - math.pi
@@ -180,7 +199,7 @@ class EulerFilter:
         """(3, 3) rotation of the present angles, eqs. 6-7."""
         theta, phi, psi = self.angles
         about_x, about_y = (phi, theta) if self.swap_as_printed else (theta, phi)
-        return Rotation.from_euler("ZYX", [psi, about_y, about_x]).as_matrix()
+        return Rotation.from_euler('ZYX', [psi, about_y, about_x]).as_matrix()
 
     def _from_gravity(self, accel: np.ndarray) -> tuple[float, float]:
         """Eq. 3."""
@@ -194,6 +213,10 @@ def euler_rates(angles: np.ndarray, gyro: np.ndarray) -> np.ndarray:
     """(3,) rates of roll, pitch, yaw [rad/s] from body rates, eq. 4; grows without bound at 90 deg of pitch."""
     theta, phi, _ = angles
     sine, cosine, tangent = math.sin(theta), math.cos(theta), math.tan(phi)
-    return np.array([gyro[0] + sine * tangent * gyro[1] + cosine * tangent * gyro[2],
-                     cosine * gyro[1] - sine * gyro[2],
-                     (sine * gyro[1] + cosine * gyro[2]) / math.cos(phi)])
+    return np.array(
+        [
+            gyro[0] + sine * tangent * gyro[1] + cosine * tangent * gyro[2],
+            cosine * gyro[1] - sine * gyro[2],
+            (sine * gyro[1] + cosine * gyro[2]) / math.cos(phi),
+        ]
+    )

@@ -1,8 +1,11 @@
-"""All modules at once: one smooth, inextensible backbone that explains every field and every attitude.
+"""
+All modules at once: one smooth, inextensible backbone that explains every field and every
+attitude.
 
-The backbone is a chain of arcs of constant twist and curvature, `PIECES` from each module to the next, so that
-arclengths hold exactly and neighbours share what they know. Against solving eq. 10 module by module, a module
-whose field says little (far away, on the equatorial plane, saturated) is held by the others.
+The backbone is a chain of arcs of constant twist and curvature, `PIECES` from each module to the
+next, so that arclengths hold exactly and neighbours share what they know. Against solving eq. 10
+module by module, a module whose field says little (far away, on the equatorial plane, saturated)
+is held by the others.
 
     minimise  sum |R^T (B(p) + b_earth) - b|^2 / sigma^2          (field, module's frame; no attitude enters)
             + sum |Log(R_imu^T R)|^2_P                              (attitude, yaw loose)
@@ -13,12 +16,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie_kernels
 from continuum_loc.robot import RobotDescription
-from continuum_loc.shape.magnet import FieldModel, evaluate_field, magnet_parameters
+from continuum_loc.shape.magnet import evaluate_field, FieldModel, magnet_parameters
+from numba import njit
+import numpy as np
 
 MAX_ITERATIONS = 50
 PIECES = 3
@@ -26,9 +28,11 @@ PIECES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BackboneFit:
-    """T_base_module (M, 4, 4); covariance (M, 6, 6) of a right perturbation [rho; phi]; strain (N, 3): twist and
-    the two curvatures of the N = PIECES * M arcs [1/m]; cost: half the sum of squares; dimension: of the
-    measurements in it; converged."""
+    """
+    T_base_module (M, 4, 4); covariance (M, 6, 6) of a right perturbation [rho; phi]; strain (N,
+    3): twist and the two curvatures of the N = PIECES * M arcs [1/m]; cost: half the sum of
+    squares; dimension: of the measurements in it; converged.
+    """
 
     T_base_module: np.ndarray
     covariance: np.ndarray
@@ -46,8 +50,13 @@ class BackboneFit:
 class BackboneSolver:
     """The joint fit for the modules at `arclengths` (M,) [m] from the base of `robot`."""
 
-    def __init__(self, robot: RobotDescription, arclengths: np.ndarray, model: FieldModel = "ring",
-                 step_sigma: float = 15.0) -> None:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        arclengths: np.ndarray,
+        model: FieldModel = 'ring',
+        step_sigma: float = 15.0,
+    ) -> None:
         """step_sigma: how much the curvature changes from one module to the next, 1 sigma [1/m]."""
         gaps = np.diff(np.asarray(arclengths, float), prepend=0.0)
         self.lengths = np.repeat(gaps / PIECES, PIECES)
@@ -55,26 +64,49 @@ class BackboneSolver:
         self.magnet_s = robot.magnet.s
         self.rest = np.array(robot.backbone.rest_strain[3:])
         sigma = np.array(robot.backbone.rest_strain_sigma[3:])
-        # The prior on the strain (its mean from module to module) and on the curvature's walk from arc to arc.
+        # The prior on the strain (its mean from module to module) and on the curvature's walk from
+        # arc to arc.
         count = len(self.lengths)
         step = np.diff(np.eye(count), axis=0)
         walk = PIECES / step_sigma**2
-        weights = [np.kron(np.eye(count), np.diag(sigma**-2.0)) / PIECES,
-                   np.kron(step.T @ step, np.diag([0.0, walk, walk]))]
+        weights = [
+            np.kron(np.eye(count), np.diag(sigma**-2.0)) / PIECES,
+            np.kron(step.T @ step, np.diag([0.0, walk, walk])),
+        ]
         self.prior = np.ascontiguousarray(sum(weights))
 
-    def solve(self, field: np.ndarray, field_sigma: np.ndarray, earth: np.ndarray, R_base_module: np.ndarray,
-              information: np.ndarray, start: np.ndarray | None = None) -> BackboneFit:
-        """Fit to field (M, 3) [T] in the modules' frames with sigma (M, 3) (inf drops a component), the Earth's
-        field (3,) [T] in the base frame, and attitudes R_base_module (M, 3, 3) with information (M, 3, 3)
-        [1/rad^2] in the modules' frames (zeros drop one). start: strain (N, 3) of an earlier fit."""
-        strain = np.tile(self.rest, (len(self.lengths), 1)) if start is None else np.array(start, dtype=float)
+    def solve(
+        self,
+        field: np.ndarray,
+        field_sigma: np.ndarray,
+        earth: np.ndarray,
+        R_base_module: np.ndarray,
+        information: np.ndarray,
+        start: np.ndarray | None = None,
+    ) -> BackboneFit:
+        """
+        Fit to field (M, 3) [T] in the modules' frames with sigma (M, 3) (inf drops a component),
+        the Earth's field (3,) [T] in the base frame, and attitudes R_base_module (M, 3, 3) with
+        information (M, 3, 3) [1/rad^2] in the modules' frames (zeros drop one). start: strain (N,
+        3) of an earlier fit.
+        """
+        strain = (
+            np.tile(self.rest, (len(self.lengths), 1))
+            if start is None
+            else np.array(start, dtype=float)
+        )
         weight = 1.0 / np.asarray(field_sigma, float) ** 2
         measured = np.where(weight > 0.0, field, 0.0)
-        known = (measured, weight, np.asarray(earth, float), np.ascontiguousarray(R_base_module),
-                 np.ascontiguousarray(information))
-        T, chain, H, cost, converged = _solve(strain, self.lengths, self.parameters, self.magnet_s, self.rest,
-                                              self.prior, *known)
+        known = (
+            measured,
+            weight,
+            np.asarray(earth, float),
+            np.ascontiguousarray(R_base_module),
+            np.ascontiguousarray(information),
+        )
+        T, chain, H, cost, converged = _solve(
+            strain, self.lengths, self.parameters, self.magnet_s, self.rest, self.prior, *known
+        )
         # The posterior of the strains, carried along the chain to every module.
         covariance = chain @ np.linalg.solve(H, chain.swapaxes(1, 2))
         dimension = int((weight > 0.0).sum() + np.linalg.matrix_rank(information).sum())
@@ -82,12 +114,36 @@ class BackboneSolver:
 
 
 @njit(cache=True)
-def _solve(strain, lengths, parameters, magnet_s, rest, prior, field, weight, earth, R_measured, information):
+def _solve(
+    strain,
+    lengths,
+    parameters,
+    magnet_s,
+    rest,
+    prior,
+    field,
+    weight,
+    earth,
+    R_measured,
+    information,
+):
     """Levenberg-Marquardt on `strain` (N, 3), in place."""
     count = 3 * lengths.size
     T, chain = _forward(strain, lengths)
-    H, slope, cost = _normal(T, chain, strain, parameters, magnet_s, rest, prior, field, weight, earth, R_measured,
-                             information)
+    H, slope, cost = _normal(
+        T,
+        chain,
+        strain,
+        parameters,
+        magnet_s,
+        rest,
+        prior,
+        field,
+        weight,
+        earth,
+        R_measured,
+        information,
+    )
     damping, converged = 1e-6, False
     for _ in range(MAX_ITERATIONS):
         damped = H.copy()
@@ -96,8 +152,20 @@ def _solve(strain, lengths, parameters, magnet_s, rest, prior, field, weight, ea
         step = -np.linalg.solve(damped, slope)
         trial = strain + step.reshape(strain.shape)
         T_trial, chain_trial = _forward(trial, lengths)
-        H_trial, slope_trial, cost_trial = _normal(T_trial, chain_trial, trial, parameters, magnet_s, rest, prior,
-                                                   field, weight, earth, R_measured, information)
+        H_trial, slope_trial, cost_trial = _normal(
+            T_trial,
+            chain_trial,
+            trial,
+            parameters,
+            magnet_s,
+            rest,
+            prior,
+            field,
+            weight,
+            earth,
+            R_measured,
+            information,
+        )
         promised = -0.5 * (slope * step).sum()
         if cost_trial <= cost:
             strain[:] = trial
@@ -134,12 +202,25 @@ def _forward(strain, lengths):
         lie_kernels.ad(xi, A)
         lie_kernels.right_coefficients(xi, c, dc)
         lie_kernels.polynomial(c, A, J, work)
-        chain[n, :, 3 * n:3 * n + 3] = lengths[n] * J[:, 3:]
-    return T[PIECES - 1::PIECES].copy(), chain[PIECES - 1::PIECES].copy()
+        chain[n, :, 3 * n : 3 * n + 3] = lengths[n] * J[:, 3:]
+    return T[PIECES - 1 :: PIECES].copy(), chain[PIECES - 1 :: PIECES].copy()
 
 
 @njit(cache=True)
-def _normal(T, chain, strain, parameters, magnet_s, rest, prior, field, weight, earth, R_measured, information):
+def _normal(
+    T,
+    chain,
+    strain,
+    parameters,
+    magnet_s,
+    rest,
+    prior,
+    field,
+    weight,
+    earth,
+    R_measured,
+    information,
+):
     """Gauss-Newton matrix, gradient and cost of the whole fit."""
     departure = (strain - rest).ravel()
     H = prior.copy()
@@ -166,7 +247,7 @@ def _normal(T, chain, strain, parameters, magnet_s, rest, prior, field, weight, 
 
 @njit(cache=True)
 def field_error(T_base_module, parameters, magnet_s, earth, measured, residual, J):
-    """residual (3,) = R^T (B(p) + earth) - measured [T], and J (3, 6) by a right perturbation [rho; phi]."""
+    """Residual (3,) = R^T (B(p) + earth) - measured [T], and J (3, 6) by a right perturbation [rho; phi]."""
     R = T_base_module[:3, :3]
     p = T_base_module[:3, 3].copy()
     p[0] -= magnet_s

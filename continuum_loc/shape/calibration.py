@@ -1,9 +1,10 @@
-"""Calibration of the modules, the magnet and the Earth's field from rests in known poses.
+"""
+Calibration of the modules, the magnet and the Earth's field from rests in known poses.
 
-One rest with the straight robot is *taring*; several, with the straight robot turned by the arm that holds it,
-are a *calibration*. Both are the same least-squares problem: priors from the datasheets settle what the rests
-leave open, and `sigma` says how well each group came out. Taring alone cannot tell an offset, which turns with
-the sensor, from the Earth's field, which does not.
+One rest with the straight robot is *taring*; several, with the straight robot turned by the arm
+that holds it, are a *calibration*. Both are the same least-squares problem: priors from the
+datasheets settle what the rests leave open, and `sigma` says how well each group came out. Taring
+alone cannot tell an offset, which turns with the sensor, from the Earth's field, which does not.
 
     gyro  = b_g
     accel = R_imu^T g + b_a
@@ -17,16 +18,15 @@ from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 
+from continuum_loc import lie
+from continuum_loc.robot import RobotDescription, Vector3
+from continuum_loc.settings import load_settings, Settings, SettingsError
+from continuum_loc.shape.attitude import GRAVITY
+from continuum_loc.shape.magnet import field_and_gradient, FieldModel
+from continuum_loc.shape.rest import Rest
 import numpy as np
 from pydantic import Field
 from scipy.optimize import least_squares
-
-from continuum_loc import lie
-from continuum_loc.robot import RobotDescription, Vector3
-from continuum_loc.settings import Settings, SettingsError, load_settings
-from continuum_loc.shape.attitude import GRAVITY
-from continuum_loc.shape.magnet import FieldModel, field_and_gradient
-from continuum_loc.shape.rest import Rest
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 
@@ -40,35 +40,45 @@ class ModuleCalibration(Settings):
 
     gyro_bias: Vector3 = ZERO
     accel_offset: Vector3 = ZERO
-    imu_turn: Vector3 = Field(ZERO, description="rotation vector of the IMU on its mount [rad]")
+    imu_turn: Vector3 = Field(ZERO, description='rotation vector of the IMU on its mount [rad]')
     hall_offset: Vector3 = ZERO
-    hall_turn: Vector3 = Field(ZERO, description="rotation vector of the Hall sensor on its mount [rad]")
+    hall_turn: Vector3 = Field(
+        ZERO, description='rotation vector of the Hall sensor on its mount [rad]'
+    )
 
 
 class Calibration(Settings):
     """What is known of a robot's modules, its magnet and the Earth's field."""
 
     modules: tuple[ModuleCalibration, ...]
-    earth_field: Vector3 = Field(ZERO, description="in map [T]")
-    remanence: float = Field(description="of the magnet [T]; negative when it is mounted upside down")
-    mounting_sigma: float = Field(0.0087, ge=0.0, description="left in the modules' rotations, 1 sigma [rad]")
+    earth_field: Vector3 = Field(ZERO, description='in map [T]')
+    remanence: float = Field(
+        description='of the magnet [T]; negative when it is mounted upside down'
+    )
+    mounting_sigma: float = Field(
+        0.0087, ge=0.0, description="left in the modules' rotations, 1 sigma [rad]"
+    )
 
     def check(self, robot: RobotDescription) -> None:
         """Raises SettingsError when this is another robot's calibration."""
         if len(self.modules) != len(robot.hall):
-            raise SettingsError(f"calibration of {len(self.modules)} modules, but robot '{robot.name}' has "
-                                f"{len(robot.hall)}")
+            raise SettingsError(
+                f"calibration of {len(self.modules)} modules, but robot '{robot.name}' has "
+                f'{len(robot.hall)}'
+            )
 
 
 class CalibrationPriors(Settings):
     """What datasheets and workshop say before any rest (1 sigma)."""
 
-    accel_offset: float = Field(0.4, gt=0.0, description="[m/s^2]")
-    hall_offset: float = Field(20e-6, gt=0.0, description="[T]")
-    mounting_deg: float = Field(1.0, gt=0.0, description="each chip on its module [deg]")
-    earth_field: float = Field(40e-6, gt=0.0, description="each component [T]")
-    moment: float = Field(0.1, gt=0.0, description="relative to the robot description")
-    pose_deg: float = Field(0.05, gt=0.0, description="how well the rests' rotations are known [deg]")
+    accel_offset: float = Field(0.4, gt=0.0, description='[m/s^2]')
+    hall_offset: float = Field(20e-6, gt=0.0, description='[T]')
+    mounting_deg: float = Field(1.0, gt=0.0, description='each chip on its module [deg]')
+    earth_field: float = Field(40e-6, gt=0.0, description='each component [T]')
+    moment: float = Field(0.1, gt=0.0, description='relative to the robot description')
+    pose_deg: float = Field(
+        0.05, gt=0.0, description="how well the rests' rotations are known [deg]"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +92,11 @@ class PosedRest:
 
 def nominal_calibration(robot: RobotDescription) -> Calibration:
     """No corrections: the robot description as it stands."""
-    return Calibration(modules=tuple(ModuleCalibration() for _ in robot.hall), remanence=robot.magnet.remanence,
-                       mounting_sigma=np.radians(0.5))
+    return Calibration(
+        modules=tuple(ModuleCalibration() for _ in robot.hall),
+        remanence=robot.magnet.remanence,
+        mounting_sigma=np.radians(0.5),
+    )
 
 
 def load_calibration(path: str | Path, robot: RobotDescription) -> Calibration:
@@ -94,16 +107,25 @@ def load_calibration(path: str | Path, robot: RobotDescription) -> Calibration:
 
 
 def module_mounts(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations of each module's IMU and Hall sensor on their ring, (M, 3, 3) each, base to tip.
+    """
+    Rotations of each module's IMU and Hall sensor on their ring, (M, 3, 3) each, base to tip.
 
     Raises SettingsError unless every Hall sensor has an IMU on its ring.
     """
-    if robot.magnet is None or not robot.hall or [h.ring for h in robot.hall] != [i.ring for i in robot.imu]:
-        raise SettingsError(f"robot '{robot.name}' cannot sense its shape: it needs a magnet, and an IMU beside each "
-                            f"Hall sensor; Hall sensors on {[sensor.ring for sensor in robot.hall]}, "
-                            f"IMUs on {[sensor.ring for sensor in robot.imu]}")
-    return (np.stack([sensor.mount.T_ring_sensor[:3, :3] for sensor in robot.imu]),
-            np.stack([sensor.mount.T_ring_sensor[:3, :3] for sensor in robot.hall]))
+    if (
+        robot.magnet is None
+        or not robot.hall
+        or [h.ring for h in robot.hall] != [i.ring for i in robot.imu]
+    ):
+        raise SettingsError(
+            f"robot '{robot.name}' cannot sense its shape: it needs a magnet, and an IMU beside each "
+            f'Hall sensor; Hall sensors on {[sensor.ring for sensor in robot.hall]}, '
+            f'IMUs on {[sensor.ring for sensor in robot.imu]}'
+        )
+    return (
+        np.stack([sensor.mount.T_ring_sensor[:3, :3] for sensor in robot.imu]),
+        np.stack([sensor.mount.T_ring_sensor[:3, :3] for sensor in robot.hall]),
+    )
 
 
 def straight_modules(robot: RobotDescription) -> np.ndarray:
@@ -113,43 +135,62 @@ def straight_modules(robot: RobotDescription) -> np.ndarray:
     return T
 
 
-def calibrate(robot: RobotDescription, rests: Sequence[PosedRest], priors: CalibrationPriors | None = None,
-              model: FieldModel = "ring") -> Calibration:
-    """Least squares over all rests. Raises CalibrationError for a reversed magnet, swapped modules, a saturated
-    channel, or rests that do not fit any correction of plausible size."""
+def calibrate(
+    robot: RobotDescription,
+    rests: Sequence[PosedRest],
+    priors: CalibrationPriors | None = None,
+    model: FieldModel = 'ring',
+) -> Calibration:
+    """
+    Least squares over all rests. Raises CalibrationError for a reversed magnet, swapped modules, a
+    saturated channel, or rests that do not fit any correction of plausible size.
+    """
     if not rests:
-        raise CalibrationError("calibration needs at least one rest")
+        raise CalibrationError('calibration needs at least one rest')
     check_wiring(robot, rests[0], model)
     problem = _Problem(robot, rests, priors or CalibrationPriors(), model)
-    solution = least_squares(problem.residuals, np.zeros(problem.size), method="lm", x_scale="jac")
+    solution = least_squares(problem.residuals, np.zeros(problem.size), method='lm', x_scale='jac')
     chi2 = 2.0 * solution.cost / problem.measured
     if chi2 > 10.0:
-        raise CalibrationError(f"the rests contradict one another: normalised misfit {chi2:.1f} (about 1 expected); "
-                               "was the robot straight and were the base's poses right?")
+        raise CalibrationError(
+            f'the rests contradict one another: normalised misfit {chi2:.1f} (about 1 expected); '
+            "was the robot straight and were the base's poses right?"
+        )
     return problem.calibration(solution.x, np.linalg.inv(solution.jac.T @ solution.jac))
 
 
-def check_wiring(robot: RobotDescription, posed: PosedRest, model: FieldModel = "ring") -> None:
-    """Compare a rest with what the robot description predicts, before any fit bends to it.
+def check_wiring(robot: RobotDescription, posed: PosedRest, model: FieldModel = 'ring') -> None:
+    """
+    Compare a rest with what the robot description predicts, before any fit bends to it.
 
-    Raises CalibrationError for saturation, a magnet mounted upside down, or modules swapped with one another.
+    Raises CalibrationError for saturation, a magnet mounted upside down, or modules swapped with
+    one another.
     """
     finite = np.isfinite(posed.rest.field).all(axis=1)
     saturated = [sensor.name for sensor, good in zip(robot.hall, finite, strict=True) if not good]
     if saturated:
-        raise CalibrationError(f"saturated at rest: {', '.join(saturated)}; choose a coarser RES or GAIN")
+        raise CalibrationError(
+            f'saturated at rest: {", ".join(saturated)}; choose a coarser RES or GAIN'
+        )
     _, hall = module_mounts(robot)
-    source = field_and_gradient(robot.magnet, _from_magnet(robot, posed.T_base_module[:, :3, 3]), model)[0]
-    expected = np.einsum("mji,mj->mi", posed.T_base_module[:, :3, :3] @ hall, source)
+    source = field_and_gradient(
+        robot.magnet, _from_magnet(robot, posed.T_base_module[:, :3, 3]), model
+    )[0]
+    expected = np.einsum('mji,mj->mi', posed.T_base_module[:, :3, :3] @ hall, source)
     order = best_assignment(posed.rest.field, expected)
-    agreement = np.einsum("mi,mi->m", posed.rest.field[order], expected)
+    agreement = np.einsum('mi,mi->m', posed.rest.field[order], expected)
     if (agreement < 0.0).all():
-        raise CalibrationError("the magnet is mounted upside down: every module reads the opposite of the expected "
-                               "field (turn it, or give the remanence in the robot file the other sign)")
-    wrong = [f"{robot.hall[place].name} reads as {robot.hall[which].name} should" for which, place in enumerate(order)
-             if which != place]
+        raise CalibrationError(
+            'the magnet is mounted upside down: every module reads the opposite of the expected '
+            'field (turn it, or give the remanence in the robot file the other sign)'
+        )
+    wrong = [
+        f'{robot.hall[place].name} reads as {robot.hall[which].name} should'
+        for which, place in enumerate(order)
+        if which != place
+    ]
     if wrong:
-        raise CalibrationError(f"modules are swapped: {'; '.join(wrong)}")
+        raise CalibrationError(f'modules are swapped: {"; ".join(wrong)}')
 
 
 def best_assignment(field: np.ndarray, expected: np.ndarray) -> np.ndarray:
@@ -164,14 +205,20 @@ def _from_magnet(robot: RobotDescription, p_base: np.ndarray) -> np.ndarray:
 
 
 class _Problem:
-    """Whitened residuals of all rests and priors in unknowns that are scaled to their priors.
+    """
+    Whitened residuals of all rests and priors in unknowns that are scaled to their priors.
 
-    The unknowns are four (M, 3) blocks (accel offset, IMU turn, Hall offset, Hall turn), the Earth's field (3,) and
-    the relative change of the moment.
+    The unknowns are four (M, 3) blocks (accel offset, IMU turn, Hall offset, Hall turn), the
+    Earth's field (3,) and the relative change of the moment.
     """
 
-    def __init__(self, robot: RobotDescription, rests: Sequence[PosedRest], priors: CalibrationPriors,
-                 model: FieldModel) -> None:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        rests: Sequence[PosedRest],
+        priors: CalibrationPriors,
+        model: FieldModel,
+    ) -> None:
         self.robot, self.modules = robot, len(robot.hall)
         self.imu_mount, self.hall_mount = module_mounts(robot)
         turn = np.radians(priors.mounting_deg)
@@ -181,18 +228,22 @@ class _Problem:
         R_map_base = np.stack([posed.T_map_base[:3, :3] for posed in rests])
         T_base_module = np.stack([posed.T_base_module for posed in rests])
         self.R_map_module = R_map_base[:, None] @ T_base_module[:, :, :3, :3]
-        source = field_and_gradient(robot.magnet, _from_magnet(robot, T_base_module[:, :, :3, 3]), model)[0]
-        self.source = np.einsum("kij,kmj->kmi", R_map_base, source)  # in map
+        source = field_and_gradient(
+            robot.magnet, _from_magnet(robot, T_base_module[:, :, :3, 3]), model
+        )[0]
+        self.source = np.einsum('kij,kmj->kmi', R_map_base, source)  # in map
         self.gyro = np.mean([posed.rest.gyro for posed in rests], axis=0)
         self.accel = np.stack([posed.rest.accel for posed in rests])
         self.field = np.stack([posed.rest.field for posed in rests])
         root = np.sqrt([posed.rest.samples for posed in rests])[:, None, None]
         pose = np.radians(priors.pose_deg)
         self.accel_sigma = np.hypot(robot.imu_model.accel_sigma / root, GRAVITY * pose)
-        # Only the Earth's part of the field turns with the base; the magnet turns along. Quantisation does not
-        # average out where the noise is below a step.
+        # Only the Earth's part of the field turns with the base; the magnet turns along.
+        # Quantisation does not average out where the noise is below a step.
         step = max(robot.hall_model.lsb) / 12**0.5
-        self.field_sigma = np.hypot(np.hypot(robot.hall_model.sigma / root, 0.2 * step), 50e-6 * pose)
+        self.field_sigma = np.hypot(
+            np.hypot(robot.hall_model.sigma / root, 0.2 * step), 50e-6 * pose
+        )
         self.measured = 2 * self.accel.size
 
     def split(self, unknowns: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -205,17 +256,40 @@ class _Problem:
         R_imu = self.R_map_module @ (self.imu_mount @ lie.so3_exp(imu_turn))
         R_hall = self.R_map_module @ (self.hall_mount @ lie.so3_exp(hall_turn))
         accel = GRAVITY * R_imu[..., 2, :] + accel_offset
-        field = np.einsum("kmji,kmj->kmi", R_hall, (1.0 + moment) * self.source + earth) + hall_offset
-        return np.concatenate([((accel - self.accel) / self.accel_sigma).ravel(),
-                               ((field - self.field) / self.field_sigma).ravel(), unknowns])
+        field = (
+            np.einsum('kmji,kmj->kmi', R_hall, (1.0 + moment) * self.source + earth) + hall_offset
+        )
+        return np.concatenate(
+            [
+                ((accel - self.accel) / self.accel_sigma).ravel(),
+                ((field - self.field) / self.field_sigma).ravel(),
+                unknowns,
+            ]
+        )
 
     def calibration(self, unknowns: np.ndarray, covariance: np.ndarray) -> Calibration:
         accel_offset, imu_turn, hall_offset, hall_turn, earth, moment = self.split(unknowns)
-        modules = tuple(ModuleCalibration(gyro_bias=tuple(self.gyro[m]), accel_offset=tuple(accel_offset[m]),
-                                          imu_turn=tuple(imu_turn[m]), hall_offset=tuple(hall_offset[m]),
-                                          hall_turn=tuple(hall_turn[m])) for m in range(self.modules))
+        modules = tuple(
+            ModuleCalibration(
+                gyro_bias=tuple(self.gyro[m]),
+                accel_offset=tuple(accel_offset[m]),
+                imu_turn=tuple(imu_turn[m]),
+                hall_offset=tuple(hall_offset[m]),
+                hall_turn=tuple(hall_turn[m]),
+            )
+            for m in range(self.modules)
+        )
         sigma = np.sqrt(np.diag(covariance)) * self.scale
-        turns = np.concatenate([sigma[3 * self.modules:6 * self.modules], sigma[9 * self.modules:12 * self.modules]])
+        turns = np.concatenate(
+            [
+                sigma[3 * self.modules : 6 * self.modules],
+                sigma[9 * self.modules : 12 * self.modules],
+            ]
+        )
         remanence = self.robot.magnet.remanence * (1.0 + moment)
-        return Calibration(modules=modules, earth_field=tuple(earth), remanence=remanence,
-                           mounting_sigma=float(np.sqrt(np.mean(turns**2))))
+        return Calibration(
+            modules=modules,
+            earth_field=tuple(earth),
+            remanence=remanence,
+            mounting_sigma=float(np.sqrt(np.mean(turns**2))),
+        )

@@ -1,12 +1,13 @@
-"""Curves through the magnet and the modules: the paper's three (eqs. 11-24), each in two forms.
+"""
+Curves through the magnet and the modules: the paper's three (eqs. 11-24), each in two forms.
 
-All take `points` (N, 3) [m] from the magnet on, and unit `tangents` (N, 3) there, in a frame whose x is the
-magnet's axis, and give points (samples, 3) of the curve in that frame.
+All take `points` (N, 3) [m] from the magnet on, and unit `tangents` (N, 3) there, in a frame whose
+x is the magnet's axis, and give points (samples, 3) of the curve in that frame.
 
-The *projected* forms are the paper's: points and tangents go to the (r, axis) half plane (eq. 12), the curve is
-fitted there and turned back by one mean direction (eqs. 23-24). With r >= 0 an S-shape folds over, and bending
-out of a plane is lost. The *spatial* forms work on the points as they are and hold for both. A straight robot
-is a line in either.
+The *projected* forms are the paper's: points and tangents go to the (r, axis) half plane (eq. 12),
+the curve is fitted there and turned back by one mean direction (eqs. 23-24). With r >= 0 an
+S-shape folds over, and bending out of a plane is lost. The *spatial* forms work on the points as
+they are and hold for both. A straight robot is a line in either.
 """
 
 from __future__ import annotations
@@ -14,24 +15,36 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-import numpy as np
 from numba import njit
+import numpy as np
 
-CurveMethod = Literal["quadratic_bezier", "cubic_bezier", "kasa_arc"]
+CurveMethod = Literal['quadratic_bezier', 'cubic_bezier', 'kasa_arc']
 PARALLEL = 1e-6  # sine of the angle below which two tangents count as parallel
 STRAIGHT = 1e-5  # sagitta over chord below which an arc is drawn as its line
 ARC_TOLERANCE = 1.5e-4  # m rms: points farther from their circle are no single arc
 
 
-def fit_curve(points: np.ndarray, tangents: np.ndarray, method: CurveMethod = "kasa_arc", projected: bool = False,
-              samples: int = 61) -> np.ndarray:
+def fit_curve(
+    points: np.ndarray,
+    tangents: np.ndarray,
+    method: CurveMethod = 'kasa_arc',
+    projected: bool = False,
+    samples: int = 61,
+) -> np.ndarray:
     """(samples, 3) points along the curve of the named method, from the first of `points` to the last."""
     forms = PROJECTED if projected else SPATIAL
     if method not in forms:
         raise ValueError(f"no curve '{method}'; valid: {', '.join(forms)}")
     points, tangents = np.asarray(points, float), np.asarray(tangents, float)
-    if points.ndim != 2 or points.shape[1] != 3 or points.shape != tangents.shape or len(points) < 3:
-        raise ValueError(f"expected points and tangents (N >= 3, 3), got {points.shape} and {tangents.shape}")
+    if (
+        points.ndim != 2
+        or points.shape[1] != 3
+        or points.shape != tangents.shape
+        or len(points) < 3
+    ):
+        raise ValueError(
+            f'expected points and tangents (N >= 3, 3), got {points.shape} and {tangents.shape}'
+        )
     return forms[method](points, tangents, samples)
 
 
@@ -50,19 +63,28 @@ def lift(planar: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.column_stack([planar[:, 1], wy * planar[:, 0], wz * planar[:, 0]])
 
 
-def projected_quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """Eqs. 11-14. The control point is where neighbouring tangents meet; a chord where they do not meet between.
+def projected_quadratic_bezier(
+    points: np.ndarray, tangents: np.ndarray, samples: int
+) -> np.ndarray:
+    """
+    Eqs. 11-14. The control point is where neighbouring tangents meet; a chord where they do not
+    meet between.
 
-    The sign of the printed kappa (eq. 14) is the opposite of the intersection's and is mended here.
+    The sign of the printed kappa (eq. 14) is the opposite of the intersection's and is mended
+    here.
     """
     p, n = project(points), project(tangents)
     chord = np.diff(p, axis=0)
     denominator = cross(n[:-1], n[1:])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide='ignore', invalid='ignore'):
         kappa = cross(chord, n[1:]) / denominator
     length = np.linalg.norm(chord, axis=1)
     meets = (np.abs(denominator) > PARALLEL) & (kappa > 0.0) & (kappa < 2.0 * length)
-    control = np.where(meets[:, None], p[:-1] + np.where(meets, kappa, 0.0)[:, None] * n[:-1], p[:-1] + 0.5 * chord)
+    control = np.where(
+        meets[:, None],
+        p[:-1] + np.where(meets, kappa, 0.0)[:, None] * n[:-1],
+        p[:-1] + 0.5 * chord,
+    )
     return lift(quadratic_chain(p[:-1], control, p[1:], samples), points)
 
 
@@ -81,19 +103,22 @@ def projected_kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -
 
 
 def quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """Two quadratic pieces from each point to the next, which keep both tangents.
+    """
+    Two quadratic pieces from each point to the next, which keep both tangents.
 
-    Tangents in space do not meet in general, and on an S-shape not between the points, so one piece cannot keep
-    both; two can always, with the control polygon of the biarc.
+    Tangents in space do not meet in general, and on an S-shape not between the points, so one
+    piece cannot keep both; two can always, with the control polygon of the biarc.
     """
     start, middle, end, first, second = _biarc_polygon(points, tangents)
-    return quadratic_chain(_interleave(start, middle), _interleave(first, second), _interleave(middle, end), samples)
+    return quadratic_chain(
+        _interleave(start, middle), _interleave(first, second), _interleave(middle, end), samples
+    )
 
 
 def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) -> np.ndarray:
     """One cubic through four points at t = 0, 1/3, 2/3, 1 (eqs. 15-16 hold in any dimension)."""
     if len(points) != 4:
-        raise ValueError(f"a cubic Bezier passes through exactly 4 points, got {len(points)}")
+        raise ValueError(f'a cubic Bezier passes through exactly 4 points, got {len(points)}')
     inner = np.array([1.0 / 3.0, 2.0 / 3.0])
     basis = _bernstein(inner)
     controls = np.linalg.solve(basis[:, 1:3], points[1:3] - basis[:, [0, 3]] @ points[[0, 3]])
@@ -101,8 +126,11 @@ def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) 
 
 
 def kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """The circle of least squares in the plane of least squares (SVD), where one arc explains the points;
-    else a chain of biarcs through points and tangents, which is still arcs, but as many as an S-shape needs."""
+    """
+    The circle of least squares in the plane of least squares (SVD), where one arc explains the
+    points; else a chain of biarcs through points and tangents, which is still arcs, but as many as
+    an S-shape needs.
+    """
     centre = points.mean(axis=0)
     _, size, axes = np.linalg.svd(points - centre, full_matrices=False)
     planar = (points - centre) @ axes[:2].T
@@ -121,32 +149,45 @@ def biarc_chain(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.nd
     headings /= np.linalg.norm(headings, axis=1, keepdims=True)
     piece, u = _pieces(len(starts), samples)
     chord = ends - starts
-    along = np.einsum("ij,ij->i", chord, headings)
+    along = np.einsum('ij,ij->i', chord, headings)
     aside = chord - along[:, None] * headings
     offset = np.linalg.norm(aside, axis=1)
     half_turn = np.arctan2(offset, along)
-    curvature = 2.0 * offset / np.einsum("ij,ij->i", chord, chord)
+    curvature = 2.0 * offset / np.einsum('ij,ij->i', chord, chord)
     normal = aside / np.maximum(offset, 1e-300)[:, None]
     turn = 2.0 * half_turn[piece] * u
-    length = np.where(curvature > 0.0, 2.0 * half_turn / np.maximum(curvature, 1e-300), along)[piece] * u
+    length = (
+        np.where(curvature > 0.0, 2.0 * half_turn / np.maximum(curvature, 1e-300), along)[piece]
+        * u
+    )
     forward = length * np.sinc(turn / np.pi)
     sideways = length * np.sin(0.5 * turn) * np.sinc(0.5 * turn / np.pi)
     return starts[piece] + forward[:, None] * headings[piece] + sideways[:, None] * normal[piece]
 
 
 Fit = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-PROJECTED: dict[str, Fit] = {"quadratic_bezier": projected_quadratic_bezier, "cubic_bezier": projected_cubic_bezier,
-                             "kasa_arc": projected_kasa_arc}
-SPATIAL: dict[str, Fit] = {"quadratic_bezier": quadratic_bezier, "cubic_bezier": cubic_bezier, "kasa_arc": kasa_arc}
+PROJECTED: dict[str, Fit] = {
+    'quadratic_bezier': projected_quadratic_bezier,
+    'cubic_bezier': projected_cubic_bezier,
+    'kasa_arc': projected_kasa_arc,
+}
+SPATIAL: dict[str, Fit] = {
+    'quadratic_bezier': quadratic_bezier,
+    'cubic_bezier': cubic_bezier,
+    'kasa_arc': kasa_arc,
+}
 
 
 # Shared parts
 
 
 def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
-    """(3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20; None when straight.
+    """
+    (3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20; None when
+    straight.
 
-    About the points' mean, eq. 20 falls apart into a 2x2 system for the centre and sigma = mean(x^2 + y^2).
+    About the points' mean, eq. 20 falls apart into a 2x2 system for the centre and sigma =
+    mean(x^2 + y^2).
     """
     mean = planar.mean(axis=0)
     q = planar - mean
@@ -155,11 +196,14 @@ def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     spread = S[0, 0] + S[1, 1]
     if spread == 0.0:
-        raise ValueError("all points of the curve coincide")
+        raise ValueError('all points of the curve coincide')
     if determinant < 1e-16 * spread**2:
         return None
     half = 0.5 * (q.T @ square)
-    centre = np.array([S[1, 1] * half[0] - S[0, 1] * half[1], S[0, 0] * half[1] - S[1, 0] * half[0]]) / determinant
+    centre = (
+        np.array([S[1, 1] * half[0] - S[0, 1] * half[1], S[0, 0] * half[1] - S[1, 0] * half[0]])
+        / determinant
+    )
     radius = np.sqrt(centre @ centre + square.mean())
     if np.sqrt(spread) / (8.0 * radius) < STRAIGHT:
         return None
@@ -185,16 +229,19 @@ def _line(planar: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _biarc_polygon(points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Start, joint, end and the two inner control points of the biarc between neighbours, (N - 1, 3) each.
+    """
+    Start, joint, end and the two inner control points of the biarc between neighbours, (N - 1, 3)
+    each.
 
     Both arms have the length d for which the middle arm of the polygon is 2 d long.
     """
     start, end, t0, t1 = points[:-1], points[1:], tangents[:-1], tangents[1:]
     chord = end - start
-    square = np.einsum("ij,ij->i", chord, chord)
-    forward = np.einsum("ij,ij->i", chord, t0 + t1)
-    spread = 2.0 * (1.0 - np.einsum("ij,ij->i", t0, t1))
-    # The positive root of spread d^2 + 2 forward d - square = 0, without cancellation for parallel tangents.
+    square = np.einsum('ij,ij->i', chord, chord)
+    forward = np.einsum('ij,ij->i', chord, t0 + t1)
+    spread = 2.0 * (1.0 - np.einsum('ij,ij->i', t0, t1))
+    # The positive root of spread d^2 + 2 forward d - square = 0, without cancellation for parallel
+    # tangents.
     d = (square / (forward + np.sqrt(forward**2 + spread * square)))[:, None]
     first, second = start + d * t0, end - d * t1
     return start, 0.5 * (first + second), end, first, second
@@ -211,7 +258,9 @@ def _pieces(count: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
     return piece, position - piece
 
 
-def quadratic_chain(start: np.ndarray, control: np.ndarray, end: np.ndarray, samples: int) -> np.ndarray:
+def quadratic_chain(
+    start: np.ndarray, control: np.ndarray, end: np.ndarray, samples: int
+) -> np.ndarray:
     """(samples, D) along quadratic Bezier pieces, eq. 13."""
     piece, u = _pieces(len(start), samples)
     u = u[:, None]
@@ -242,13 +291,17 @@ def arclength(points: np.ndarray) -> np.ndarray:
 def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
     """(F, 3) points at fractions (F,) of the curve's length."""
     s = arclength(points)
-    return np.column_stack([np.interp(np.asarray(fractions) * s[-1], s, column) for column in points.T])
+    return np.column_stack(
+        [np.interp(np.asarray(fractions) * s[-1], s, column) for column in points.T]
+    )
 
 
 @njit(cache=True)
 def _cross3(a, b):
-    """a x b; NumPy's own takes seconds to compile."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    """A x b; NumPy's own takes seconds to compile."""
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 @njit(cache=True)
@@ -264,17 +317,20 @@ def extended(points: np.ndarray, length: float) -> np.ndarray:
     bend = _cross3(first, second)
     size = np.sqrt((bend**2).sum())
     chord = np.sqrt((second**2).sum())
-    # Two chords of one circle: they turn by the arc between their middles; the tangent is half a chord further on.
+    # Two chords of one circle: they turn by the arc between their middles; the tangent is half a
+    # chord further on.
     turn = np.arctan2(size, (first * second).sum())
     curvature = 2.0 * np.sin(turn / 2) / chord
     tangent, normal = second / chord, np.zeros(3)
     if size > 1e-30:
         normal = _cross3(bend / size, tangent)
-        tangent, normal = (np.cos(turn / 2) * tangent + np.sin(turn / 2) * normal,
-                           np.cos(turn / 2) * normal - np.sin(turn / 2) * tangent)
+        tangent, normal = (
+            np.cos(turn / 2) * tangent + np.sin(turn / 2) * normal,
+            np.cos(turn / 2) * normal - np.sin(turn / 2) * tangent,
+        )
     count = max(2, int(np.ceil(len(points) * missing / s[-1])))
     out = np.empty((len(points) + count, 3))
-    out[:len(points)] = points
+    out[: len(points)] = points
     for i in range(count):
         run = missing * (i + 1) / count
         angle = curvature * run

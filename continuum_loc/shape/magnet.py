@@ -1,12 +1,15 @@
-"""The field of the ring magnet at the base: the paper's point dipole (eq. 2), and the exact ring.
+"""
+The field of the ring magnet at the base: the paper's point dipole (eq. 2), and the exact ring.
 
-Both take positions relative to the magnet's centre, in the magnet's frame: its axis is x (as the base's x in
-the robot files), metres in, tesla out. A negative `remanence` is a magnet mounted upside down.
+Both take positions relative to the magnet's centre, in the magnet's frame: its axis is x (as the
+base's x in the robot files), metres in, tesla out. A negative `remanence` is a magnet mounted
+upside down.
 
-The ring is two coaxial current sheets of opposite sign, at the outer and the inner radius. A sheet's field is
-Derby and Olbert, "Cylindrical magnets and ideal solenoids" (Am. J. Phys. 78, 2010), in Bulirsch's complete
-elliptic integral `cel`; its derivative along the axis is the field of a current loop at either end, and the
-rest of the gradient follows from div B = 0 and curl B = 0 outside the magnet. So the gradient is exact too.
+The ring is two coaxial current sheets of opposite sign, at the outer and the inner radius. A
+sheet's field is Derby and Olbert, "Cylindrical magnets and ideal solenoids" (Am. J. Phys. 78,
+2010), in Bulirsch's complete elliptic integral `cel`; its derivative along the axis is the field
+of a current loop at either end, and the rest of the gradient follows from div B = 0 and curl B = 0
+outside the magnet. So the gradient is exact too.
 """
 
 from __future__ import annotations
@@ -14,13 +17,12 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-import numpy as np
-from numba import njit
-
 from continuum_loc.robot import Magnet
+from numba import njit
+import numpy as np
 
 MU_0 = 4e-7 * math.pi
-FieldModel = Literal["ring", "dipole"]
+FieldModel = Literal['ring', 'dipole']
 
 
 def magnet_volume(magnet: Magnet) -> float:
@@ -35,50 +37,67 @@ def dipole_moment(magnet: Magnet) -> float:
 
 def with_moment(magnet: Magnet, moment: float) -> Magnet:
     """The same magnet with its remanence set so that its moment is `moment` [A m^2]."""
-    return magnet.model_copy(update={"remanence": moment * MU_0 / magnet_volume(magnet)})
+    return magnet.model_copy(update={'remanence': moment * MU_0 / magnet_volume(magnet)})
 
 
-def magnet_parameters(magnet: Magnet, model: FieldModel = "ring") -> np.ndarray:
-    """(5,) what the compiled kernels need: mu_0 M / 4 pi, then remanence / pi, half length, inner and outer
-    radius. The half length is 0 for the dipole model."""
-    if model not in ("ring", "dipole"):
+def magnet_parameters(magnet: Magnet, model: FieldModel = 'ring') -> np.ndarray:
+    """
+    (5,) what the compiled kernels need: mu_0 M / 4 pi, then remanence / pi, half length, inner and
+    outer radius. The half length is 0 for the dipole model.
+    """
+    if model not in ('ring', 'dipole'):
         raise ValueError(f"field model '{model}' does not exist; valid: ring, dipole")
-    half_length = magnet.length / 2.0 if model == "ring" else 0.0
-    return np.array([1e-7 * dipole_moment(magnet), magnet.remanence / math.pi, half_length,
-                     magnet.inner_diameter / 2.0, magnet.outer_diameter / 2.0])
+    half_length = magnet.length / 2.0 if model == 'ring' else 0.0
+    return np.array(
+        [
+            1e-7 * dipole_moment(magnet),
+            magnet.remanence / math.pi,
+            half_length,
+            magnet.inner_diameter / 2.0,
+            magnet.outer_diameter / 2.0,
+        ]
+    )
 
 
 def ring_field(magnet: Magnet, p: np.ndarray) -> np.ndarray:
-    """(..., 3) field [T] of the axially magnetised ring at `p` (..., 3) [m], magnet frame (axis x).
+    """
+    (..., 3) field [T] of the axially magnetised ring at `p` (..., 3) [m], magnet frame (axis x).
 
     Exact outside the magnet's material (the bore included).
     """
-    return field_and_gradient(magnet, p, "ring")[0]
+    return field_and_gradient(magnet, p, 'ring')[0]
 
 
 def dipole_field(magnet: Magnet, p: np.ndarray) -> np.ndarray:
     """(..., 3) field [T] of the point dipole of equal moment at `p` (..., 3) [m], magnet frame (paper eq. 2)."""
-    return field_and_gradient(magnet, p, "dipole")[0]
+    return field_and_gradient(magnet, p, 'dipole')[0]
 
 
-def field_and_gradient(magnet: Magnet, p: np.ndarray, model: FieldModel = "ring") -> tuple[np.ndarray, np.ndarray]:
+def field_and_gradient(
+    magnet: Magnet, p: np.ndarray, model: FieldModel = 'ring'
+) -> tuple[np.ndarray, np.ndarray]:
     """Field (..., 3) [T] and its gradient dB_i/dp_j (..., 3, 3) [T/m] at `p` (..., 3) [m], magnet frame."""
     p = np.asarray(p, dtype=float)
     if p.shape[-1:] != (3,):
-        raise ValueError(f"positions must have shape (..., 3), got {p.shape}")
-    field, gradient = _field_batch(magnet_parameters(magnet, model), np.ascontiguousarray(p.reshape(-1, 3)))
+        raise ValueError(f'positions must have shape (..., 3), got {p.shape}')
+    field, gradient = _field_batch(
+        magnet_parameters(magnet, model), np.ascontiguousarray(p.reshape(-1, 3))
+    )
     return field.reshape(p.shape), gradient.reshape(*p.shape, 3)
 
 
 def invert_dipole(magnet: Magnet, field: np.ndarray) -> np.ndarray:
-    """(..., 3) the one position with x >= 0 whose dipole field is `field` (..., 3) [T]; -p has the same field.
+    """
+    (..., 3) the one position with x >= 0 whose dipole field is `field` (..., 3) [T]; -p has the
+    same field.
 
-    In the plane of axis and field, tan(beta) = 3 tan(theta) / (2 - tan^2(theta)) for the field's angle beta
-    and the position's angle theta off the axis: a quadratic with one root in 0..90 degrees for each beta.
+    In the plane of axis and field, tan(beta) = 3 tan(theta) / (2 - tan^2(theta)) for the field's
+    angle beta and the position's angle theta off the axis: a quadratic with one root in 0..90
+    degrees for each beta.
     """
     field = np.asarray(field, dtype=float)
     if field.shape[-1:] != (3,):
-        raise ValueError(f"fields must have shape (..., 3), got {field.shape}")
+        raise ValueError(f'fields must have shape (..., 3), got {field.shape}')
     rows = np.ascontiguousarray(field.reshape(-1, 3))
     k = 1e-7 * dipole_moment(magnet)
     return np.array([invert_dipole_once(k, row) for row in rows]).reshape(field.shape)
@@ -89,7 +108,8 @@ def invert_dipole_once(k, field):
     """`invert_dipole` of one field (3,), for k = mu_0 M / 4 pi."""
     sign = 1.0 if k > 0.0 else -1.0
     along, across = sign * field[0], math.hypot(field[1], field[2])
-    # The root of across u^2 + 3 along u - 2 across = 0, in the form that does not cancel for either sign.
+    # The root of across u^2 + 3 along u - 2 across = 0, in the form that does not cancel for
+    # either sign.
     root = math.sqrt(9.0 * along**2 + 8.0 * across**2)
     if along >= 0.0:
         theta = math.atan2(4.0 * across, root + 3.0 * along)
@@ -142,7 +162,12 @@ def _ring(strength, half_length, inner, outer, p, field, gradient):
     radial, axial, radial_slope, axial_slope = _sheet(outer, half_length, rho, p[0])
     if inner > 0.0:
         r, a, dr, da = _sheet(inner, half_length, rho, p[0])
-        radial, axial, radial_slope, axial_slope = radial - r, axial - a, radial_slope - dr, axial_slope - da
+        radial, axial, radial_slope, axial_slope = (
+            radial - r,
+            axial - a,
+            radial_slope - dr,
+            axial_slope - da,
+        )
     # Near the axis B_rho = -rho/2 dB_x/dx, which is also the limit of B_rho / rho.
     per_rho = radial / rho if rho > 1e-9 else -0.5 * axial_slope
     outward = -axial_slope - per_rho  # div B = 0
@@ -180,8 +205,10 @@ def _sheet(a, half_length, rho, x):
 
 @njit(cache=True)
 def _cel(kc, p, c, s):
-    """Bulirsch's complete elliptic integral of (c cos^2 + s sin^2) / ((cos^2 + p sin^2) sqrt(cos^2 + kc^2 sin^2))
-    over 0..pi/2, for p > 0 and kc > 0."""
+    """
+    Bulirsch's complete elliptic integral of (c cos^2 + s sin^2) / ((cos^2 + p sin^2) sqrt(cos^2 +
+    kc^2 sin^2)) over 0..pi/2, for p > 0 and kc > 0.
+    """
     k = kc
     p = math.sqrt(p)
     s = s / p

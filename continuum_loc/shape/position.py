@@ -1,30 +1,31 @@
-"""Where a module is, from the field it measures: the paper's bounded least squares (eq. 10), compiled.
+"""
+Where a module is, from the field it measures: the paper's bounded least squares (eq. 10),
+compiled.
 
     min |b - B(p)|^2   subject to   lower <= p <= upper,
 
-p in the magnet's frame (axis x), B the dipole or the ring of `magnet`. B(-p) = B(p), so the bounds keep p on
-the side that the robot is on; there the dipole has one solution only, except on the equatorial plane, where
-the gradient loses a rank. Where starts still end in different optima that fit alike, the one nearest to the
-prior is taken and the module is marked ambiguous.
+p in the magnet's frame (axis x), B the dipole or the ring of `magnet`. B(-p) = B(p), so the bounds
+keep p on the side that the robot is on; there the dipole has one solution only, except on the
+equatorial plane, where the gradient loses a rank. Where starts still end in different optima that
+fit alike, the one nearest to the prior is taken and the module is marked ambiguous.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
-from numba import njit
+import math
 
 from continuum_loc.robot import Magnet
 from continuum_loc.shape.magnet import (
-    FieldModel,
     evaluate_field,
     field_and_gradient,
+    FieldModel,
     invert_dipole,
     invert_dipole_once,
     magnet_parameters,
 )
+from numba import njit
+import numpy as np
 
 MAX_ITERATIONS = 60
 STEP_TOLERANCE = 1e-11  # m
@@ -33,11 +34,13 @@ SAME_OPTIMUM = 1e-5  # m: closer ends of two starts are one optimum
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionFit:
-    """Positions of M modules in the magnet's frame.
+    """
+    Positions of M modules in the magnet's frame.
 
-    position: (M, 3) m. residual: (M,) |b - B(p)| in T. bound: (M, 3) int, -1 on the lower bound, 1 on the upper,
-    0 inside. converged: (M,) whether the first-order (KKT) conditions hold: the gradient is zero on every free
-    axis and points out of the box on every bound axis. ambiguous: (M,) another optimum fits as well.
+    position: (M, 3) m. residual: (M,) |b - B(p)| in T. bound: (M, 3) int, -1 on the lower bound, 1
+    on the upper, 0 inside. converged: (M,) whether the first-order (KKT) conditions hold: the
+    gradient is zero on every free axis and points out of the box on every bound axis. ambiguous:
+    (M,) another optimum fits as well.
     """
 
     position: np.ndarray
@@ -54,13 +57,20 @@ class PositionFit:
 
 
 class PositionSolver:
-    """Eq. 10 for modules at known arclengths [m] from the magnet.
+    """
+    Eq. 10 for modules at known arclengths [m] from the magnet.
 
-    The bounds are a box: no module is farther from the magnet than its arclength, and it lies on the magnet's
-    positive side.
+    The bounds are a box: no module is farther from the magnet than its arclength, and it lies on
+    the magnet's positive side.
     """
 
-    def __init__(self, magnet: Magnet, arclengths: np.ndarray, model: FieldModel = "ring", slack: float = 1.05) -> None:
+    def __init__(
+        self,
+        magnet: Magnet,
+        arclengths: np.ndarray,
+        model: FieldModel = 'ring',
+        slack: float = 1.05,
+    ) -> None:
         self.magnet, self.model = magnet, model
         self.parameters = magnet_parameters(magnet, model)
         self.arclengths = np.asarray(arclengths, float)
@@ -69,33 +79,55 @@ class PositionSolver:
         self.upper = np.concatenate([reach, reach, reach], axis=1)
 
     def solve(self, field: np.ndarray, start: np.ndarray | None = None) -> PositionFit:
-        """Positions from `field` (M, 3) [T] in the magnet's frame.
+        """
+        Positions from `field` (M, 3) [T] in the magnet's frame.
 
-        start: (M, 3) prior positions [m], by default the closed-form inverse of the dipole. Raises ValueError
+        start: (M, 3) prior positions [m], by default the closed-form inverse of the dipole. Raises
+        ValueError
         for a field that is not finite: a saturated module has no position of its own.
         """
         field = np.ascontiguousarray(field, dtype=float)
         if field.shape != self.lower.shape or not np.isfinite(field).all():
-            raise ValueError(f"expected a finite field of shape {self.lower.shape}, got {field.tolist()}")
-        prior = invert_dipole(self.magnet, field) if start is None else np.ascontiguousarray(start, dtype=float)
+            raise ValueError(
+                f'expected a finite field of shape {self.lower.shape}, got {field.tolist()}'
+            )
+        prior = (
+            invert_dipole(self.magnet, field)
+            if start is None
+            else np.ascontiguousarray(start, dtype=float)
+        )
         return PositionFit(*_solve_all(self.parameters, field, prior, self.lower, self.upper))
 
     def field(self, position: np.ndarray) -> np.ndarray:
         """(M, 3) field [T] of the model at `position` (M, 3) [m]."""
         return field_and_gradient(self.magnet, position, self.model)[0]
 
-    def covariance(self, position: np.ndarray, field: np.ndarray, sigma: float, attitude: np.ndarray,
-                   ) -> tuple[np.ndarray, np.ndarray]:
-        """(M, 6, 6) covariance of position and attitude errors in the magnet's frame, and observability (M,).
+    def covariance(
+        self,
+        position: np.ndarray,
+        field: np.ndarray,
+        sigma: float,
+        attitude: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        (M, 6, 6) covariance of position and attitude errors in the magnet's frame, and
+        observability (M,).
 
-        sigma: white noise of the field [T]; attitude (M, 3, 3): covariance of the module's rotation error phi in
-        the magnet's frame [rad^2], which turns the measured field: db = phi x b. The prior that a module lies
-        within its arclength (one sigma of half of it) keeps the result finite where the field says nothing;
-        `observable` is whether the field narrows that prior at least fivefold in every direction.
+        sigma: white noise of the field [T]; attitude (M, 3, 3): covariance of the module's
+        rotation error phi in the magnet's frame [rad^2], which turns the measured field: db = phi
+        x b. The prior that a module lies within its arclength (one sigma of half of it) keeps the
+        result finite where the field says nothing; `observable` is whether the field narrows that
+        prior at least fivefold in every direction.
         """
         prior_sigma = 0.5 * self.arclengths
-        return _covariance(self.parameters, np.ascontiguousarray(position), np.ascontiguousarray(field), sigma**2,
-                           np.ascontiguousarray(attitude), prior_sigma)
+        return _covariance(
+            self.parameters,
+            np.ascontiguousarray(position),
+            np.ascontiguousarray(field),
+            sigma**2,
+            np.ascontiguousarray(attitude),
+            prior_sigma,
+        )
 
 
 @njit(cache=True)
@@ -135,7 +167,9 @@ def _solve_all(parameters, fields, prior, lower, upper):
         for k in range(3):
             if k > 0:
                 start = invert_dipole_once(parameters[0], fields[m]) * (1.0 if k == 1 else -1.0)
-            p, cost, count, stationary = _solve_one(parameters, fields[m], start, lower[m], upper[m])
+            p, cost, count, stationary = _solve_one(
+                parameters, fields[m], start, lower[m], upper[m]
+            )
             iterations[m] += count
             # An alternative replaces the prior's own optimum only by fitting clearly better.
             apart = math.sqrt(((p - position[m]) ** 2).sum())

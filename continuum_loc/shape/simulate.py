@@ -1,8 +1,10 @@
-"""Samples of a Hall + IMU arm in exactly known shapes: grooves, S-shapes, bending out of a plane.
+"""
+Samples of a Hall + IMU arm in exactly known shapes: grooves, S-shapes, bending out of a plane.
 
-The arm is a chain of short arcs of constant strain, `PIECES` from each module to the next and to the tip. A motion
-holds a posture or passes smoothly to the next. The field is the true ring magnet's and the Earth's; chips are
-mounted askew, have offsets, noise, quantisation steps and full scales, and every module keeps its own clock.
+The arm is a chain of short arcs of constant strain, `PIECES` from each module to the next and to
+the tip. A motion holds a posture or passes smoothly to the next. The field is the true ring
+magnet's and the Earth's; chips are mounted askew, have offsets, noise, quantisation steps and full
+scales, and every module keeps its own clock.
 """
 
 from __future__ import annotations
@@ -10,37 +12,55 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from continuum_loc import lie
+from continuum_loc.measurements import FieldSample, ImuSample, NANOSECONDS, nanoseconds
+from continuum_loc.robot import RobotDescription, Vector3
+from continuum_loc.settings import Settings
+from continuum_loc.shape.attitude import GRAVITY
+from continuum_loc.shape.calibration import module_mounts, PosedRest, straight_modules
+from continuum_loc.shape.magnet import ring_field
+from continuum_loc.shape.rest import RestWindow
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
 
-from continuum_loc import lie
-from continuum_loc.measurements import NANOSECONDS, FieldSample, ImuSample, nanoseconds
-from continuum_loc.robot import RobotDescription, Vector3
-from continuum_loc.settings import Settings
-from continuum_loc.shape.attitude import GRAVITY
-from continuum_loc.shape.calibration import PosedRest, module_mounts, straight_modules
-from continuum_loc.shape.magnet import ring_field
-from continuum_loc.shape.rest import RestWindow
-
 PIECES = 6
-GROOVES = {"straight": 0.0, "160 mm": 1.0 / 0.080, "80 mm": 1.0 / 0.040}  # curvature by groove diameter [1/m]
+GROOVES = {
+    'straight': 0.0,
+    '160 mm': 1.0 / 0.080,
+    '80 mm': 1.0 / 0.040,
+}  # curvature by groove diameter [1/m]
 
 
 class Imperfections(Settings):
     """What the true arm has and the robot description does not say. All sigmas; zero makes a perfect arm."""
 
-    mounting_deg: float = Field(0.5, ge=0.0, description="turn of every chip, about a random axis [deg]")
-    hall_offset: float = Field(10e-6, ge=0.0, description="zero-field offset [T]")
-    accel_offset: float = Field(0.25, ge=0.0, description="zero-g offset, MPU6050: 50 mg is 0.49 [m/s^2]")
-    moment: float = Field(0.02, ge=0.0, description="magnet's moment against the description, relative")
-    base_pose_deg: float = Field(0.05, ge=0.0, description="of the arm that turns the base [deg]")
-    earth_field: Vector3 = Field((20e-6, 3e-6, -43e-6), description="in map [T]")
-    noise: float = Field(1.0, ge=0.0, description="scales the datasheet's white noise and gyro bias")
+    mounting_deg: float = Field(
+        0.5, ge=0.0, description='turn of every chip, about a random axis [deg]'
+    )
+    hall_offset: float = Field(10e-6, ge=0.0, description='zero-field offset [T]')
+    accel_offset: float = Field(
+        0.25, ge=0.0, description='zero-g offset, MPU6050: 50 mg is 0.49 [m/s^2]'
+    )
+    moment: float = Field(
+        0.02, ge=0.0, description="magnet's moment against the description, relative"
+    )
+    base_pose_deg: float = Field(0.05, ge=0.0, description='of the arm that turns the base [deg]')
+    earth_field: Vector3 = Field((20e-6, 3e-6, -43e-6), description='in map [T]')
+    noise: float = Field(
+        1.0, ge=0.0, description="scales the datasheet's white noise and gyro bias"
+    )
 
 
-PERFECT = Imperfections(mounting_deg=0.0, hall_offset=0.0, accel_offset=0.0, moment=0.0, base_pose_deg=0.0,
-                        earth_field=(0.0, 0.0, 0.0), noise=0.0)
+PERFECT = Imperfections(
+    mounting_deg=0.0,
+    hall_offset=0.0,
+    accel_offset=0.0,
+    moment=0.0,
+    base_pose_deg=0.0,
+    earth_field=(0.0, 0.0, 0.0),
+    noise=0.0,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +82,9 @@ class Motion:
     @property
     def arrivals(self) -> np.ndarray:
         """(N,) times at which each posture is reached."""
-        return np.cumsum(np.asarray(self.travel)) + np.concatenate([[0.0], np.cumsum(self.hold)[:-1]])
+        return np.cumsum(np.asarray(self.travel)) + np.concatenate(
+            [[0.0], np.cumsum(self.hold)[:-1]]
+        )
 
     @property
     def departures(self) -> np.ndarray:
@@ -73,7 +95,7 @@ class Motion:
         """R_map_base (K, 3, 3) and strain (K, N, 3) at times (K,); acceleration is continuous throughout."""
         arrivals, departures = self.arrivals, self.departures
         knots = np.sort(np.concatenate([arrivals, departures]))
-        index = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
+        index = np.clip(np.searchsorted(knots, times, side='right') - 1, 0, len(knots) - 2)
         span = np.maximum(knots[index + 1] - knots[index], 1e-12)
         u = np.clip((times - knots[index]) / span, 0.0, 1.0)
         # Quintic smoothstep between knots; a hold's two knots are the same posture.
@@ -93,10 +115,20 @@ def bent(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.
     return profile(robot, lambda s: (np.full_like(s, curvature), np.full_like(s, azimuth)))
 
 
-def s_shape(robot: RobotDescription, curvature: float, azimuth: float = 0.0, halves: float = 1.0) -> np.ndarray:
-    """(N, 3) strain of an S, whose curvature passes smoothly from `curvature` [1/m] at the base to its opposite
-    `halves` times; from 2 on its tangent turns across the magnet's axis."""
-    return profile(robot, lambda s: (curvature * np.cos(halves * np.pi * s / robot.length), np.full_like(s, azimuth)))
+def s_shape(
+    robot: RobotDescription, curvature: float, azimuth: float = 0.0, halves: float = 1.0
+) -> np.ndarray:
+    """
+    (N, 3) strain of an S, whose curvature passes smoothly from `curvature` [1/m] at the base to
+    its opposite `halves` times; from 2 on its tangent turns across the magnet's axis.
+    """
+    return profile(
+        robot,
+        lambda s: (
+            curvature * np.cos(halves * np.pi * s / robot.length),
+            np.full_like(s, azimuth),
+        ),
+    )
 
 
 def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi / 2) -> np.ndarray:
@@ -104,16 +136,22 @@ def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi 
     return profile(robot, lambda s: (np.full_like(s, curvature), turn * s / robot.length))
 
 
-def profile(robot: RobotDescription, bend: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def profile(
+    robot: RobotDescription, bend: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
     """(N, 3) strain of a twist-free shape: `bend` gives curvature [1/m] and azimuth [rad] at arclengths (N,)."""
     ends = piece_ends(robot)
     curvature, azimuth = bend(ends - 0.5 * np.diff(ends, prepend=0.0))
-    return np.column_stack([np.zeros_like(ends), -curvature * np.sin(azimuth), curvature * np.cos(azimuth)])
+    return np.column_stack(
+        [np.zeros_like(ends), -curvature * np.sin(azimuth), curvature * np.cos(azimuth)]
+    )
 
 
 def piece_ends(robot: RobotDescription) -> np.ndarray:
     """(N,) arclengths [m] of the ends of the arcs: every `PIECES`-th is a module's, the last is the tip's."""
-    marks = np.array([0.0, *(robot.sensor_arclength(sensor.name) for sensor in robot.hall), robot.length])
+    marks = np.array(
+        [0.0, *(robot.sensor_arclength(sensor.name) for sensor in robot.hall), robot.length]
+    )
     shares = np.arange(1, PIECES + 1) / PIECES
     return (marks[:-1, None] + np.diff(marks)[:, None] * shares).ravel()
 
@@ -121,18 +159,22 @@ def piece_ends(robot: RobotDescription) -> np.ndarray:
 class Arm:
     """One simulated arm, its imperfections drawn from `seed`."""
 
-    def __init__(self, robot: RobotDescription, imperfections: Imperfections | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, robot: RobotDescription, imperfections: Imperfections | None = None, seed: int = 0
+    ) -> None:
         self.robot, self.imperfections = robot, imperfections or Imperfections()
         self.rng = np.random.default_rng(seed)
         truth, modules = self.imperfections, len(robot.hall)
         imu, hall = module_mounts(robot)
         self.R_module_imu = imu @ self._askew(modules)
         self.R_module_hall = hall @ self._askew(modules)
-        self.gyro_bias = truth.noise * robot.imu_model.gyro_bias_sigma * self.rng.standard_normal((modules, 3))
+        self.gyro_bias = (
+            truth.noise * robot.imu_model.gyro_bias_sigma * self.rng.standard_normal((modules, 3))
+        )
         self.accel_offset = truth.accel_offset * self.rng.standard_normal((modules, 3))
         self.hall_offset = truth.hall_offset * self.rng.standard_normal((modules, 3))
         remanence = robot.magnet.remanence * (1.0 + truth.moment * self.rng.standard_normal())
-        self.magnet = robot.magnet.model_copy(update={"remanence": remanence})
+        self.magnet = robot.magnet.model_copy(update={'remanence': remanence})
         self.ends = piece_ends(robot)
         self.lengths = np.diff(self.ends, prepend=0.0)
 
@@ -141,14 +183,19 @@ class Arm:
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         return lie.so3_exp(np.radians(self.imperfections.mounting_deg) * axis)
 
-    def posture(self, strain: np.ndarray | None = None, R_base: np.ndarray | None = None) -> Posture:
+    def posture(
+        self, strain: np.ndarray | None = None, R_base: np.ndarray | None = None
+    ) -> Posture:
         """A posture with the base turned by `R_base` (3, 3) in map against the robot description's."""
         turn = np.eye(3) if R_base is None else R_base
-        return Posture(turn @ self.robot.base.T_map_base[:3, :3], bent(self.robot, 0.0) if strain is None else strain)
+        return Posture(
+            turn @ self.robot.base.T_map_base[:3, :3],
+            bent(self.robot, 0.0) if strain is None else strain,
+        )
 
     def T_base_module(self, strain: np.ndarray) -> np.ndarray:
         """(..., M, 4, 4) poses of the modules in the base frame, strain (..., N, 3)."""
-        return self._chain(strain)[..., PIECES - 1:-1:PIECES, :, :]
+        return self._chain(strain)[..., PIECES - 1 : -1 : PIECES, :, :]
 
     def _chain(self, strain: np.ndarray) -> np.ndarray:
         """(..., N, 4, 4) poses of the ends of all arcs."""
@@ -163,10 +210,14 @@ class Arm:
         piece = np.minimum(np.searchsorted(self.ends, s), len(self.ends) - 1)
         start = np.concatenate([np.eye(4)[None], self._chain(strain)[:-1]])
         within = s - np.concatenate([[0.0], self.ends[:-1]])[piece]
-        step = lie.exp(within[:, None] * np.hstack([np.tile([1.0, 0.0, 0.0], (len(s), 1)), strain[piece]]))
+        step = lie.exp(
+            within[:, None] * np.hstack([np.tile([1.0, 0.0, 0.0], (len(s), 1)), strain[piece]])
+        )
         return (start[piece] @ step)[:, :3, 3]
 
-    def record(self, motion: Motion, start_stamp: int = NANOSECONDS) -> list[ImuSample | FieldSample]:
+    def record(
+        self, motion: Motion, start_stamp: int = NANOSECONDS
+    ) -> list[ImuSample | FieldSample]:
         """All samples of the motion in stamp order; the motion begins at `start_stamp`."""
         end = motion.departures[-1]
         samples: list[ImuSample | FieldSample] = []
@@ -189,24 +240,36 @@ class Arm:
         for shift in (-h, 0.0, h):  # central differences of exact poses
             R_map_base, T_base_module = self._poses(m, motion, times + shift)
             R.append(R_map_base @ T_base_module[:, :3, :3])
-            p.append(np.einsum("kij,kj->ki", R_map_base, T_base_module[:, :3, 3]))
+            p.append(np.einsum('kij,kj->ki', R_map_base, T_base_module[:, :3, 3]))
         R_map_imu = R[1] @ self.R_module_imu[m]
         rate = lie.so3_log(R[0].swapaxes(1, 2) @ R[2]) / (2.0 * h) @ self.R_module_imu[m]
         force = (p[0] - 2.0 * p[1] + p[2]) / h**2 + [0.0, 0.0, GRAVITY]
         shape = rate.shape
-        gyro = rate + self.gyro_bias[m] + noise * model.gyro_sigma * self.rng.standard_normal(shape)
-        accel = np.einsum("kji,kj->ki", R_map_imu, force) + self.accel_offset[m]
+        gyro = (
+            rate + self.gyro_bias[m] + noise * model.gyro_sigma * self.rng.standard_normal(shape)
+        )
+        accel = np.einsum('kji,kj->ki', R_map_imu, force) + self.accel_offset[m]
         accel += noise * model.accel_sigma * self.rng.standard_normal(shape)
-        gyro, accel = (np.clip(a, -full, full) for a, full in ((gyro, model.gyro_range), (accel, model.accel_range)))
+        gyro, accel = (
+            np.clip(a, -full, full)
+            for a, full in ((gyro, model.gyro_range), (accel, model.accel_range))
+        )
         name, stamps = self.robot.imu[m].name, stamps_of(times, start)
-        return (ImuSample(stamp, name, g, a) for stamp, g, a in zip(stamps, gyro, accel, strict=True))
+        return (
+            ImuSample(stamp, name, g, a) for stamp, g, a in zip(stamps, gyro, accel, strict=True)
+        )
 
-    def _hall(self, m: int, motion: Motion, times: np.ndarray, start: int) -> Iterator[FieldSample]:
+    def _hall(
+        self, m: int, motion: Motion, times: np.ndarray, start: int
+    ) -> Iterator[FieldSample]:
         model = self.robot.hall_model
         R_map_base, T = self._poses(m, motion, times)
         source = ring_field(self.magnet, T[:, :3, 3] - [self.robot.magnet.s, 0.0, 0.0])
-        in_base = source + np.einsum("kji,j->ki", R_map_base, self.imperfections.earth_field)
-        field = np.einsum("kji,kj->ki", T[:, :3, :3] @ self.R_module_hall[m], in_base) + self.hall_offset[m]
+        in_base = source + np.einsum('kji,j->ki', R_map_base, self.imperfections.earth_field)
+        field = (
+            np.einsum('kji,kj->ki', T[:, :3, :3] @ self.R_module_hall[m], in_base)
+            + self.hall_offset[m]
+        )
         field += self.imperfections.noise * model.sigma * self.rng.standard_normal(field.shape)
         lsb = np.asarray(model.lsb)
         read = np.where(np.abs(field) <= model.saturation, np.round(field / lsb) * lsb, np.nan)
@@ -214,11 +277,16 @@ class Arm:
         return (FieldSample(stamp, name, b) for stamp, b in zip(stamps, read, strict=True))
 
     def calibration_rests(self, seconds: float = 2.0) -> list[PosedRest]:
-        """Rests of the straight arm, the base turned through `CALIBRATION_TURNS` by an arm that is off by
-        `base_pose_deg`; the poses told are the commanded ones."""
+        """
+        Rests of the straight arm, the base turned through `CALIBRATION_TURNS` by an arm that is
+        off by `base_pose_deg`; the poses told are the commanded ones.
+        """
         rests = []
         for turn in CALIBRATION_TURNS:
-            R_told = self.robot.base.T_map_base[:3, :3] @ Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+            R_told = (
+                self.robot.base.T_map_base[:3, :3]
+                @ Rotation.from_euler('xyz', turn, degrees=True).as_matrix()
+            )
             off = np.radians(self.imperfections.base_pose_deg) * self.rng.standard_normal(3)
             true = Posture(R_told @ lie.so3_exp(off), bent(self.robot, 0.0))
             rests.append(self._rest(true, R_told, seconds))
@@ -243,11 +311,24 @@ def stamps_of(times: np.ndarray, start: int) -> list[int]:
     return [start + nanoseconds(time) for time in times]
 
 
-# Turns of the base about its own axes (deg): upright, over to four sides, upside down, and about the tangent.
-CALIBRATION_TURNS = ((0, 0, 0), (0, 80, 0), (0, -80, 0), (0, 0, 80), (0, 0, -80), (0, 150, 0), (90, 60, 0),
-                     (180, 0, 60), (-90, -60, 0), (180, 0, 0))
+# Turns of the base about its own axes (deg): upright, over to four sides, upside down, and about
+# the tangent.
+CALIBRATION_TURNS = (
+    (0, 0, 0),
+    (0, 80, 0),
+    (0, -80, 0),
+    (0, 0, 80),
+    (0, 0, -80),
+    (0, 150, 0),
+    (90, 60, 0),
+    (180, 0, 60),
+    (-90, -60, 0),
+    (180, 0, 0),
+)
 
 
-def groove_motion(arm: Arm, strain: np.ndarray, rest: float = 2.0, travel: float = 2.0, hold: float = 2.0) -> Motion:
+def groove_motion(
+    arm: Arm, strain: np.ndarray, rest: float = 2.0, travel: float = 2.0, hold: float = 2.0
+) -> Motion:
     """Rest straight and upright, then into the groove, and stay there."""
     return Motion([arm.posture(), arm.posture(strain)], [rest, hold], [0.0, travel])

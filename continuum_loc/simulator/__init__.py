@@ -3,4 +3,4 @@
 from continuum_loc.simulator.model import SimulationDiverged
 from continuum_loc.simulator.world import World
 
-__all__ = ["SimulationDiverged", "World"]
+__all__ = ['SimulationDiverged', 'World']

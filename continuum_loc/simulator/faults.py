@@ -1,43 +1,45 @@
-"""Faults on request: each wraps a stream of samples, from the simulator or from a bag, and yields the faulty stream.
+"""
+Faults on request: each wraps a stream of samples, from the simulator or from a bag, and yields the
+faulty stream.
 
     faulty = Dropout(sensors=("ring2_*",), probability=0.3, seed=1)(samples)
 
-`sensors` are patterns of source names: a sensor's own name, `strain` or `joint_states`. Times are seconds from the
-stream's first stamp. Truth passes untouched. Samples are yielded in order of arrival: a delay or a wrong clock
-makes their stamps go back, as on a real bus. Wrong mounting is no matter of the stream: see `miscalibrated`.
+`sensors` are patterns of source names: a sensor's own name, `strain` or `joint_states`. Times are
+seconds from the stream's first stamp. Truth passes untouched. Samples are yielded in order of
+arrival: a delay or a wrong clock makes their stamps go back, as on a real bus. Wrong mounting is
+no matter of the stream: see `miscalibrated`.
 """
 
 from __future__ import annotations
 
-import heapq
-import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+import heapq
+import itertools
 from typing import Any
-
-import numpy as np
-from scipy.spatial.transform import Rotation
 
 from continuum_loc import lie
 from continuum_loc.measurements import (
-    NANOSECONDS,
-    TOF_VALID,
     EncoderSample,
     FieldSample,
     ImuSample,
-    StrainSample,
-    TofFrame,
-    TruthSample,
+    NANOSECONDS,
     nanoseconds,
     seconds,
+    StrainSample,
+    TOF_VALID,
+    TofFrame,
+    TruthSample,
 )
 from continuum_loc.robot import Mount, RobotDescription, Sensor
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def source(sample: Any) -> str:
     """Name of what a sample comes from: its sensor, else `strain`, `joint_states` or `truth`."""
-    kinds = {StrainSample: "strain", EncoderSample: "joint_states", TruthSample: "truth"}
+    kinds = {StrainSample: 'strain', EncoderSample: 'joint_states', TruthSample: 'truth'}
     return kinds.get(type(sample)) or sample.sensor
 
 
@@ -45,14 +47,16 @@ def source(sample: Any) -> str:
 class Fault:
     """Base: applies `alter` to the chosen sensors' samples in [start, end); `alter` returns what goes on, or None."""
 
-    sensors: tuple[str, ...] = ("*",)
+    sensors: tuple[str, ...] = ('*',)
     start: float = 0.0
-    end: float = float("inf")
+    end: float = float('inf')
     seed: int = 0
 
     def __post_init__(self) -> None:
         if not self.start < self.end:
-            raise ValueError(f"{type(self).__name__}: start {self.start} s must come before end {self.end} s")
+            raise ValueError(
+                f'{type(self).__name__}: start {self.start} s must come before end {self.end} s'
+            )
 
     def __call__(self, stream: Iterable[Any]) -> Iterator[Any]:
         rng, epoch = np.random.default_rng(self.seed), None
@@ -68,7 +72,10 @@ class Fault:
 
     def strikes(self, sample: Any, epoch: int) -> bool:
         """Whether the sample is one of the chosen sensors', at a time when the fault is present."""
-        if isinstance(sample, TruthSample) or not self.start <= seconds(sample.stamp, epoch) < self.end:
+        if (
+            isinstance(sample, TruthSample)
+            or not self.start <= seconds(sample.stamp, epoch) < self.end
+        ):
             return False
         return any(fnmatchcase(source(sample), pattern) for pattern in self.sensors)
 
@@ -106,8 +113,11 @@ class BiasStep(Fault):
 
     def alter(self, sample, rng, memory):
         if isinstance(sample, ImuSample):
-            return replace(sample, angular_velocity=sample.angular_velocity + self.gyro,
-                           linear_acceleration=sample.linear_acceleration + self.accelerometer)
+            return replace(
+                sample,
+                angular_velocity=sample.angular_velocity + self.gyro,
+                linear_acceleration=sample.linear_acceleration + self.accelerometer,
+            )
         if isinstance(sample, FieldSample):
             return replace(sample, field=sample.field + self.field)
         return sample
@@ -115,7 +125,9 @@ class BiasStep(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class Outliers(Fault):
-    """Each valid ToF zone, with `probability`, reads a range drawn evenly from `ranges` [m], still called valid.
+    """
+    Each valid ToF zone, with `probability`, reads a range drawn evenly from `ranges` [m], still
+    called valid.
 
     IMU samples get, with the same probability, a spike of `gyro_spike` rad/s about a random axis.
     """
@@ -129,7 +141,9 @@ class Outliers(Fault):
             return self._tof(sample, rng)
         if isinstance(sample, ImuSample):
             axis = rng.standard_normal(3)
-            spike = self.gyro_spike * axis / np.linalg.norm(axis) * (rng.random() < self.probability)
+            spike = (
+                self.gyro_spike * axis / np.linalg.norm(axis) * (rng.random() < self.probability)
+            )
             return replace(sample, angular_velocity=sample.angular_velocity + spike)
         return sample
 
@@ -149,7 +163,7 @@ class ClockOffset(Fault):
     drift: float = 0.0
 
     def alter(self, sample, rng, memory):
-        since = seconds(sample.stamp, memory.setdefault("first stamp", sample.stamp))
+        since = seconds(sample.stamp, memory.setdefault('first stamp', sample.stamp))
         error = self.offset + self.drift * since + self.jitter * rng.standard_normal()
         return replace(sample, stamp=sample.stamp + nanoseconds(error))
 
@@ -166,7 +180,11 @@ class Delay(Fault):
         waiting: list[tuple[float, int, Any]] = []  # by arrival, ties in the order of the stream
         for order, sample in zip(itertools.count(), stream):
             epoch = sample.stamp if epoch is None else epoch
-            late = max(0.0, self.delay + self.jitter * rng.standard_normal()) if self.strikes(sample, epoch) else 0.0
+            late = (
+                max(0.0, self.delay + self.jitter * rng.standard_normal())
+                if self.strikes(sample, epoch)
+                else 0.0
+            )
             heapq.heappush(waiting, (sample.stamp + late * NANOSECONDS, order, sample))
             while waiting and waiting[0][0] <= sample.stamp:
                 yield heapq.heappop(waiting)[2]
@@ -174,9 +192,16 @@ class Delay(Fault):
             yield heapq.heappop(waiting)[2]
 
 
-def miscalibrated(robot: RobotDescription, position_sigma: float, rotation_sigma_deg: float,
-                  seed: int, sensors: tuple[str, ...] = ("*",)) -> RobotDescription:
-    """The robot with every chosen sensor mounted a little wrong, for `World`; estimate with the nominal one.
+def miscalibrated(
+    robot: RobotDescription,
+    position_sigma: float,
+    rotation_sigma_deg: float,
+    seed: int,
+    sensors: tuple[str, ...] = ('*',),
+) -> RobotDescription:
+    """
+    The robot with every chosen sensor mounted a little wrong, for `World`; estimate with the
+    nominal one.
 
     position_sigma: m, rotation_sigma_deg: deg, both per axis (1 sigma).
     """
@@ -184,16 +209,20 @@ def miscalibrated(robot: RobotDescription, position_sigma: float, rotation_sigma
     sigma = np.repeat([position_sigma, np.radians(rotation_sigma_deg)], 3)
 
     def moved(sensor: Sensor) -> Sensor:
-        error = sigma * rng.standard_normal(6)  # drawn for every sensor, so that the choice does not shift the rest
+        error = sigma * rng.standard_normal(
+            6
+        )  # drawn for every sensor, so that the choice does not shift the rest
         if not any(fnmatchcase(sensor.name, pattern) for pattern in sensors):
             return sensor
-        return sensor.model_copy(update={"mount": _mount(sensor.mount.T_ring_sensor @ lie.exp(error))})
+        return sensor.model_copy(
+            update={'mount': _mount(sensor.mount.T_ring_sensor @ lie.exp(error))}
+        )
 
-    kinds = ("tof", "imu", "hall", "trackers")
+    kinds = ('tof', 'imu', 'hall', 'trackers')
     groups = {kind: tuple(moved(sensor) for sensor in getattr(robot, kind)) for kind in kinds}
     return robot.model_copy(update=groups)
 
 
 def _mount(T_ring_sensor: np.ndarray) -> Mount:
-    rpy = Rotation.from_matrix(T_ring_sensor[:3, :3]).as_euler("xyz", degrees=True)
+    rpy = Rotation.from_matrix(T_ring_sensor[:3, :3]).as_euler('xyz', degrees=True)
     return Mount(xyz=tuple(T_ring_sensor[:3, 3].tolist()), rpy_deg=tuple(rpy.tolist()))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from continuum_loc.simulator import convex
 from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene import Scene, SceneError
 from continuum_loc.simulator.scene_cache import cached_scene
+import numpy as np
 
 _SMALLEST, _LARGEST = 0.05, 50.0  # a continuum robot's surroundings, longest edge [m]
 _REFLECTANCE = 0.5
@@ -17,10 +16,11 @@ _WALL = 0.05  # thickness given to a room that is modelled by its inner surface 
 
 
 def import_mesh(path: Path) -> Scene:
-    """A scene from an STL, OBJ or PLY file in metres and the map frame. Raises SceneError.
+    """
+    A scene from an STL, OBJ or PLY file in metres and the map frame. Raises SceneError.
 
-    The mesh is either a solid (faces counter-clockwise seen from outside), or the inner surface of a room (faces
-    counter-clockwise seen from inside).
+    The mesh is either a solid (faces counter-clockwise seen from outside), or the inner surface of
+    a room (faces counter-clockwise seen from inside).
     """
     mesh = _load(path)
     check_mesh(mesh.vertices, mesh.faces, str(path))
@@ -31,10 +31,12 @@ def import_mesh(path: Path) -> Scene:
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     """Raise SceneError unless a mesh has a credible size, no degenerate faces and no holes, and is oriented."""
     if len(faces) == 0:
-        raise SceneError(f"{where}: no faces; export a triangle mesh, not points or curves")
+        raise SceneError(f'{where}: no faces; export a triangle mesh, not points or curves')
     if not np.all(np.isfinite(vertices)):
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise SceneError(f"{where}: vertex {bad} is {vertices[bad]}; every coordinate must be finite")
+        raise SceneError(
+            f'{where}: vertex {bad} is {vertices[bad]}; every coordinate must be finite'
+        )
     _check_size(vertices[np.unique(faces)], where)
     _check_degenerate(vertices, faces, where)
     _check_closed(vertices, faces, where)
@@ -44,11 +46,11 @@ def _load(path: Path):
     import trimesh
 
     if not path.is_file():
-        raise SceneError(f"{path}: no such file")
+        raise SceneError(f'{path}: no such file')
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+        mesh = trimesh.load(path, force='mesh', process=False)
     except Exception as error:  # the parsers raise whatever they stumble on
-        raise SceneError(f"{path}: cannot be read as {path.suffix[1:].upper()}: {error}") from None
+        raise SceneError(f'{path}: cannot be read as {path.suffix[1:].upper()}: {error}') from None
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # STL repeats vertices per face
     return mesh
 
@@ -58,9 +60,15 @@ def _check_size(vertices: np.ndarray, where: str) -> None:
     longest = float(extent.max())
     if _SMALLEST <= longest <= _LARGEST:
         return
-    hint = "; its units look like millimetres: scale it by 0.001" if _SMALLEST <= longest / 1000.0 <= _LARGEST else ""
-    raise SceneError(f"{where}: measures {' x '.join(f'{edge:.4g}' for edge in extent)} m{hint}. The longest edge must "
-                     f"lie between {_SMALLEST} and {_LARGEST} m")
+    hint = (
+        '; its units look like millimetres: scale it by 0.001'
+        if _SMALLEST <= longest / 1000.0 <= _LARGEST
+        else ''
+    )
+    raise SceneError(
+        f'{where}: measures {" x ".join(f"{edge:.4g}" for edge in extent)} m{hint}. The longest edge must '
+        f'lie between {_SMALLEST} and {_LARGEST} m'
+    )
 
 
 def _check_degenerate(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
@@ -69,26 +77,40 @@ def _check_degenerate(vertices: np.ndarray, faces: np.ndarray, where: str) -> No
     flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-9 * longest
     if flat.any():
         first = int(np.flatnonzero(flat)[0])
-        raise SceneError(f"{where}: {int(flat.sum())} degenerate faces without area, the first is face {first} at "
-                         f"{_place(a[first])}; remove them (MeshLab: Remove Zero Area Faces)")
+        raise SceneError(
+            f'{where}: {int(flat.sum())} degenerate faces without area, the first is face {first} at '
+            f'{_place(a[first])}; remove them (MeshLab: Remove Zero Area Faces)'
+        )
 
 
 def _check_closed(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     """Each directed edge must be met by its reverse, once."""
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    edges, index, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(
+        np.int64
+    )
+    edges, index, count = np.unique(
+        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     if (count == 1).any():
         middle = vertices[edges[count == 1]].mean(axis=(0, 1))
-        raise SceneError(f"{where}: {int((count == 1).sum())} open edges, holes near {_place(middle)}; close them "
-                         "(MeshLab: Close Holes; Blender: Mesh > Clean Up > Fill Holes)")
+        raise SceneError(
+            f'{where}: {int((count == 1).sum())} open edges, holes near {_place(middle)}; close them '
+            '(MeshLab: Close Holes; Blender: Mesh > Clean Up > Fill Holes)'
+        )
     if (count > 2).any():
         place = vertices[edges[count > 2][0]].mean(axis=0)
-        raise SceneError(f"{where}: {int((count > 2).sum())} edges join more than two faces, the first near "
-                         f"{_place(place)}; separate or unite the bodies that meet there")
-    forward = np.bincount(index.ravel(), weights=np.where(directed[:, 0] < directed[:, 1], 1.0, -1.0))
+        raise SceneError(
+            f'{where}: {int((count > 2).sum())} edges join more than two faces, the first near '
+            f'{_place(place)}; separate or unite the bodies that meet there'
+        )
+    forward = np.bincount(
+        index.ravel(), weights=np.where(directed[:, 0] < directed[:, 1], 1.0, -1.0)
+    )
     if np.any(forward != 0.0):
-        raise SceneError(f"{where}: {int((forward != 0.0).sum())} edges between faces that look opposite ways; make "
-                         "the orientation consistent (MeshLab: Re-Orient All Faces Coherently)")
+        raise SceneError(
+            f'{where}: {int((forward != 0.0).sum())} edges between faces that look opposite ways; make '
+            'the orientation consistent (MeshLab: Re-Orient All Faces Coherently)'
+        )
 
 
 def _scene(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Scene:
@@ -96,16 +118,17 @@ def _scene(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Scene:
     faces = np.array(faces, dtype=np.int32)
     hulls = convex_pieces(*with_walls(vertices, faces), str(path))
     owner = np.zeros(len(faces), dtype=np.int32)
-    return Scene(path.stem, vertices, faces, owner, (path.stem,), np.full(len(faces), _REFLECTANCE), hulls)
+    return Scene(
+        path.stem, vertices, faces, owner, (path.stem,), np.full(len(faces), _REFLECTANCE), hulls
+    )
 
 
 def with_walls(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A solid as it is; the inner surface of a room as the walls round it."""
     if _volume(vertices, faces) > 0.0:
         return vertices, faces
-    from manifold3d import Manifold
-
     from continuum_loc.simulator.solids import mesh_of, solid_of
+    from manifold3d import Manifold
 
     low, high = vertices.min(axis=0) - _WALL, vertices.max(axis=0) + _WALL
     block = Manifold.cube(tuple(high - low)).translate(tuple(low))
@@ -114,8 +137,8 @@ def with_walls(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return float(np.einsum("ij,ij->", np.cross(a, b), c)) / 6.0
+    return float(np.einsum('ij,ij->', np.cross(a, b), c)) / 6.0
 
 
 def _place(point: np.ndarray) -> str:
-    return f"({', '.join(f'{value:.3f}' for value in point)})"
+    return f'({", ".join(f"{value:.3f}" for value in point)})'

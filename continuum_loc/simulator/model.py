@@ -1,8 +1,11 @@
-"""The robot as a MuJoCo model: a rod of rigid links on ball joints, tendons, an insertion drive, contacts.
+"""
+The robot as a MuJoCo model: a rod of rigid links on ball joints, tendons, an insertion drive,
+contacts.
 
-Nodes at s_0 = 0 ... s_N = L. Body i is rigid and centred on node i; it reaches half a segment to each side,
-and neighbours meet in a joint in the middle of their segment. So node i is the middle of its link, the joint
-spring EI / h is the segment's bending stiffness exactly, and the two half links at the ends are clamped and
+Nodes at s_0 = 0 ... s_N = L. Body i is rigid and centred on node i; it reaches half a segment to
+each side, and neighbours meet in a joint in the middle of their segment. So node i is the middle
+of its link, the joint spring EI / h is the segment's bending stiffness exactly, and the two half
+links at the ends are clamped and
 free as they should be: second-order accurate in h.
 """
 
@@ -10,24 +13,31 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from continuum_loc.robot import Ring, RobotDescription
 from continuum_loc.settings import SettingsError
-from continuum_loc.simulator.plant import PlantSettings, Profile, node_arclengths
+from continuum_loc.simulator.plant import node_arclengths, PlantSettings, Profile
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     import mujoco
 
 GRAVITY = 9.81
 ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
-NODE_PREFIX = "node"
+NODE_PREFIX = 'node'
 REST_SPEED = 1e-4
 SETTLE_LIMIT = 60.0  # s of simulated time
-SETTLE_DAMPING = 8.0  # damping while settling, relative to the plant's: near critical for the first mode
+SETTLE_DAMPING = (
+    8.0  # damping while settling, relative to the plant's: near critical for the first mode
+)
 QUIET_STEPS = 20
-STICTION = (0.999, 0.999, 0.001, 0.5, 2.0)  # near-hard: MuJoCo's default friction creeps, and forgets a hysteresis
+STICTION = (
+    0.999,
+    0.999,
+    0.001,
+    0.5,
+    2.0,
+)  # near-hard: MuJoCo's default friction creeps, and forgets a hysteresis
 DIVERGED_SPEED = 1e3  # rad/s or m/s
 GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
 
@@ -36,10 +46,17 @@ class SimulationDiverged(RuntimeError):
     """The simulation cannot go on; the message says when, where and what to change."""
 
 
-def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
-               supported: bool = False) -> mujoco.MjSpec:
-    """The model before compilation. `scene` gives the convex pieces to collide with, None the empty space;
-    `supported` lets something else carry the rod's weight."""
+def build_spec(
+    robot: RobotDescription,
+    plant: PlantSettings,
+    scene=None,
+    profile: str = 'live',
+    supported: bool = False,
+) -> mujoco.MjSpec:
+    """
+    The model before compilation. `scene` gives the convex pieces to collide with, None the empty
+    space; `supported` lets something else carry the rod's weight.
+    """
     import mujoco
 
     chosen = plant.profile(profile)
@@ -49,7 +66,9 @@ def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profil
     spec.option.gravity = (0.0, 0.0, 0.0 if supported else -GRAVITY)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.solver = mujoco.mjtSolver.mjSOL_CG
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # divergence is ours to report
+    spec.option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    )  # divergence is ours to report
     spec.compiler.autolimits = True
     nodes = node_arclengths(robot, plant, chosen.link_length)
     _check_step(plant, nodes, chosen.time_step)
@@ -60,8 +79,13 @@ def build_spec(robot: RobotDescription, plant: PlantSettings, scene=None, profil
     return spec
 
 
-def build_model(robot: RobotDescription, plant: PlantSettings, scene=None, profile: str = "live",
-                supported: bool = False) -> mujoco.MjModel:
+def build_model(
+    robot: RobotDescription,
+    plant: PlantSettings,
+    scene=None,
+    profile: str = 'live',
+    supported: bool = False,
+) -> mujoco.MjModel:
     """Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip."""
     return build_spec(robot, plant, scene, profile, supported).compile()
 
@@ -78,11 +102,13 @@ def advance(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     joint = model.joint(int(model.dof_jntid[worst])).name
     raise SimulationDiverged(
         f"the simulation diverged at {data.time:.4f} s in joint '{joint}' ({speed[worst]:.3g} rad/s or m/s): shorten "
-        f"`time_step` (now {model.opt.timestep} s) or raise `relaxation` in the plant, or lower the forces there")
+        f'`time_step` (now {model.opt.timestep} s) or raise `relaxation` in the plant, or lower the forces there'
+    )
 
 
 def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_SPEED) -> None:
-    """Bring the model to rest under its present controls and applied forces; velocities end at zero.
+    """
+    Bring the model to rest under its present controls and applied forces; velocities end at zero.
 
     rest_speed: what every link has to be slower than, m/s and rad/s. Raises SimulationDiverged.
     """
@@ -93,8 +119,9 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_
         while quiet < QUIET_STEPS:
             if data.time > SETTLE_LIMIT:
                 raise SimulationDiverged(
-                    f"the robot did not come to rest within {SETTLE_LIMIT} s under its first tensions: raise "
-                    "`relaxation` in the plant, or begin the trajectory without contact")
+                    f'the robot did not come to rest within {SETTLE_LIMIT} s under its first tensions: raise '
+                    '`relaxation` in the plant, or begin the trajectory without contact'
+                )
             advance(model, data)
             quiet = quiet + 1 if np.abs(data.cvel).max() < rest_speed else 0
     finally:
@@ -102,16 +129,35 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_
     data.qvel[:] = 0.0
 
 
-def uniform_rod(links: int, length: float, EI: float, mass_per_metre: float, *, EA: float | None = None,
-                supported: bool = False, relaxation: float = 0.05, time_step: float = 0.005) -> mujoco.MjModel:
-    """A plain rod along x, clamped at the origin, for comparison with mechanics. Its last body, `tip`, has no mass
-    and lies at the rod's end: loads go there."""
-    robot = RobotDescription(name="rod", length=length, radius=0.01 * length, rings=(Ring(name="end", s=length),))
+def uniform_rod(
+    links: int,
+    length: float,
+    EI: float,
+    mass_per_metre: float,
+    *,
+    EA: float | None = None,
+    supported: bool = False,
+    relaxation: float = 0.05,
+    time_step: float = 0.005,
+) -> mujoco.MjModel:
+    """
+    A plain rod along x, clamped at the origin, for comparison with mechanics. Its last body,
+    `tip`, has no mass and lies at the rod's end: loads go there.
+    """
+    robot = RobotDescription(
+        name='rod', length=length, radius=0.01 * length, rings=(Ring(name='end', s=length),)
+    )
     profile = Profile(link_length=length / links, time_step=time_step)
-    plant = PlantSettings(EI=EI, GJ=EI, EA=EA, mass_per_metre=mass_per_metre, relaxation=relaxation,
-                          profiles={"rod": profile})
-    spec = build_spec(robot, plant, None, "rod", supported)
-    tip = spec.body(f"{NODE_PREFIX}{links}").add_body(name="tip")
+    plant = PlantSettings(
+        EI=EI,
+        GJ=EI,
+        EA=EA,
+        mass_per_metre=mass_per_metre,
+        relaxation=relaxation,
+        profiles={'rod': profile},
+    )
+    spec = build_spec(robot, plant, None, 'rod', supported)
+    tip = spec.body(f'{NODE_PREFIX}{links}').add_body(name='tip')
     tip.mass, tip.inertia, tip.explicitinertial = 1e-9, (1e-12, 1e-12, 1e-12), True
     return spec.compile()
 
@@ -120,19 +166,26 @@ def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> No
     """Joint springs are implicit; what stays explicit is the insertion drive, stable to omega * step < 2."""
     omega = np.sqrt(plant.carriage_stiffness / plant.carriage_mass)
     if omega * time_step > 1.0:
-        raise SettingsError(f"time_step {time_step} s is too long for the insertion drive "
-                            f"({omega:.0f} rad/s): use at most {1.0 / omega:.4f} s, or soften carriage_stiffness")
+        raise SettingsError(
+            f'time_step {time_step} s is too long for the insertion drive '
+            f'({omega:.0f} rad/s): use at most {1.0 / omega:.4f} s, or soften carriage_stiffness'
+        )
 
 
 def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndarray) -> None:
     parent, joint_frame = _add_base(spec, robot, plant)
-    half = np.concatenate([[0.0], np.diff(nodes) / 2.0, [0.0]])  # half[i], half[i + 1]: reach of node i back, forth
+    half = np.concatenate(
+        [[0.0], np.diff(nodes) / 2.0, [0.0]]
+    )  # half[i], half[i + 1]: reach of node i back, forth
     for i in range(len(nodes)):
-        body = parent.add_body(name=f"{NODE_PREFIX}{i}", pos=joint_frame)
+        body = parent.add_body(name=f'{NODE_PREFIX}{i}', pos=joint_frame)
         if i > 0:
             _add_joints(body, i, plant, 2.0 * half[i])
         _add_link(body, robot, plant, half[i], half[i + 1])
-        parent, joint_frame = body, (half[i + 1] + (half[i + 1] if i + 1 < len(nodes) else 0.0), 0.0, 0.0)
+        parent, joint_frame = (
+            body,
+            (half[i + 1] + (half[i + 1] if i + 1 < len(nodes) else 0.0), 0.0, 0.0),
+        )
 
 
 def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
@@ -140,11 +193,17 @@ def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
     import mujoco
 
     quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
-    carriage = spec.worldbody.add_body(name="carriage", pos=robot.base.xyz, quat=quat)
-    if robot.base.insertion.mode != "fixed":
-        carriage.add_joint(name="insertion", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0),
-                           armature=plant.carriage_mass)
-        drive = spec.add_actuator(name="insertion", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="insertion")
+    carriage = spec.worldbody.add_body(name='carriage', pos=robot.base.xyz, quat=quat)
+    if robot.base.insertion.mode != 'fixed':
+        carriage.add_joint(
+            name='insertion',
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=(1, 0, 0),
+            armature=plant.carriage_mass,
+        )
+        drive = spec.add_actuator(
+            name='insertion', trntype=mujoco.mjtTrn.mjTRN_JOINT, target='insertion'
+        )
         drive.set_to_position(kp=plant.carriage_stiffness, kv=carriage_damping(plant))
     return carriage, (0.0, 0.0, 0.0)
 
@@ -160,13 +219,26 @@ def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
 
     pos = (-segment / 2.0, 0.0, 0.0)
     if plant.EA is not None:
-        body.add_joint(name=f"stretch{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0), pos=pos,
-                       stiffness=[plant.EA / segment, 0, 0], damping=[plant.relaxation * plant.EA / segment, 0, 0])
-    body.add_joint(name=f"bend{i}", type=mujoco.mjtJoint.mjJNT_BALL, pos=pos,
-                   stiffness=[plant.EI / segment, 0, 0], damping=[plant.relaxation * plant.EI / segment, 0, 0])
+        body.add_joint(
+            name=f'stretch{i}',
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=(1, 0, 0),
+            pos=pos,
+            stiffness=[plant.EA / segment, 0, 0],
+            damping=[plant.relaxation * plant.EA / segment, 0, 0],
+        )
+    body.add_joint(
+        name=f'bend{i}',
+        type=mujoco.mjtJoint.mjJNT_BALL,
+        pos=pos,
+        stiffness=[plant.EI / segment, 0, 0],
+        damping=[plant.relaxation * plant.EI / segment, 0, 0],
+    )
 
 
-def _add_link(body, robot: RobotDescription, plant: PlantSettings, back: float, forth: float) -> None:
+def _add_link(
+    body, robot: RobotDescription, plant: PlantSettings, back: float, forth: float
+) -> None:
     """Inertia of a solid cylinder from -back to +forth of the node, and the capsule that touches the scene."""
     import mujoco
 
@@ -176,35 +248,53 @@ def _add_link(body, robot: RobotDescription, plant: PlantSettings, back: float, 
     across = mass * (robot.radius**2 / 4.0 + length**2 / 12.0)
     body.mass, body.ipos, body.inertia = mass, (centre, 0.0, 0.0), (axial, across, across)
     body.explicitinertial = True
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(-back, 0, 0, forth, 0, 0), size=(robot.radius, 0, 0),
-                  mass=0.0, friction=(plant.contact_friction, 0.005, 0.0001), contype=ROBOT_BIT, conaffinity=SCENE_BIT,
-                  rgba=(0.9, 0.6, 0.2, 1.0))
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=(-back, 0, 0, forth, 0, 0),
+        size=(robot.radius, 0, 0),
+        mass=0.0,
+        friction=(plant.contact_friction, 0.005, 0.0001),
+        contype=ROBOT_BIT,
+        conaffinity=SCENE_BIT,
+        rgba=(0.9, 0.6, 0.2, 1.0),
+    )
 
 
 def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
-    """Each tendon threads a channel in every link up to its module's end; its actuator pulls with ctrl newtons.
+    """
+    Each tendon threads a channel in every link up to its module's end; its actuator pulls with
+    ctrl newtons.
 
-    A channel opens at GUIDE / 2 of a segment from each joint. Its straight stretch across the joint has the moment
-    arm r cos(phi / 2) + GUIDE h / 2 sin(phi / 2): short stretches keep the second term, which a rod that is guided
-    all along does not have, small.
+    A channel opens at GUIDE / 2 of a segment from each joint. Its straight stretch across the
+    joint has the moment arm r cos(phi / 2) + GUIDE h / 2 sin(phi / 2): short stretches keep the
+    second term, which a rod that is guided all along does not have, small.
     """
     import mujoco
 
     names = iter(plant.tendon_names)
-    reach = (1.0 - GUIDE) / 2.0 * np.diff(nodes)  # from a node to the channel's mouth, in each segment
+    reach = (
+        (1.0 - GUIDE) / 2.0 * np.diff(nodes)
+    )  # from a node to the channel's mouth, in each segment
     openings = [mouth for i, x in enumerate(reach) for mouth in ((i, x), (i + 1, -x))]
     for group in plant.tendons:
         last = int(np.argmin(np.abs(nodes - group.end)))
         for azimuth in np.radians(group.azimuth_deg):
             name = next(names)
             offset = (group.radius * np.cos(azimuth), group.radius * np.sin(azimuth))
-            tendon = spec.add_tendon(name=name, frictionloss=group.friction, solimp_friction=STICTION)
-            for k, (i, x) in enumerate([(0, 0.0), *openings[:2 * last], (last, 0.0)]):
-                site = f"{name}_site{k}"
-                spec.body(f"{NODE_PREFIX}{i}").add_site(name=site, pos=(x, *offset), group=4)
+            tendon = spec.add_tendon(
+                name=name, frictionloss=group.friction, solimp_friction=STICTION
+            )
+            for k, (i, x) in enumerate([(0, 0.0), *openings[: 2 * last], (last, 0.0)]):
+                site = f'{name}_site{k}'
+                spec.body(f'{NODE_PREFIX}{i}').add_site(name=site, pos=(x, *offset), group=4)
                 tendon.wrap_site(site)
-            pull = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_TENDON, target=name,
-                                     ctrllimited=True, ctrlrange=(0.0, group.max_force))
+            pull = spec.add_actuator(
+                name=name,
+                trntype=mujoco.mjtTrn.mjTRN_TENDON,
+                target=name,
+                ctrllimited=True,
+                ctrlrange=(0.0, group.max_force),
+            )
             pull.set_to_motor()
             pull.gear = (-1.0, 0, 0, 0, 0, 0)
 
@@ -216,10 +306,17 @@ def _add_scene(spec, robot: RobotDescription, plant: PlantSettings, scene) -> No
     for i, vertices in enumerate(scene.hulls):
         if not _reachable(robot, vertices):
             continue
-        spec.add_mesh(name=f"hull{i}", uservert=vertices.ravel())
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull{i}", group=3, mass=0.0,
-                                friction=(plant.contact_friction, 0.005, 0.0001),
-                                contype=SCENE_BIT, conaffinity=ROBOT_BIT, rgba=(0.3, 0.7, 0.3, 1.0))
+        spec.add_mesh(name=f'hull{i}', uservert=vertices.ravel())
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f'hull{i}',
+            group=3,
+            mass=0.0,
+            friction=(plant.contact_friction, 0.005, 0.0001),
+            contype=SCENE_BIT,
+            conaffinity=ROBOT_BIT,
+            rgba=(0.3, 0.7, 0.3, 1.0),
+        )
 
 
 def _reachable(robot: RobotDescription, vertices: np.ndarray) -> bool:

@@ -1,8 +1,10 @@
-"""The rod's continuous motion, from the states at the time steps.
+"""
+The rod's continuous motion, from the states at the time steps.
 
-Poses at the steps are exact. Between them each frame follows the cubic Hermite curve in the local variable on
-SE(3), whose velocities at the steps are the mean of the two neighbouring steps' twists; so velocity is the
-derivative of pose, everywhere, and every sensor can be sampled at its own instant.
+Poses at the steps are exact. Between them each frame follows the cubic Hermite curve in the local
+variable on SE(3), whose velocities at the steps are the mean of the two neighbouring steps'
+twists; so velocity is the derivative of pose, everywhere, and every sensor can be sampled at its
+own instant.
 """
 
 from __future__ import annotations
@@ -10,14 +12,14 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 from continuum_loc import lie
+import numpy as np
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """The robot at the end of one time step.
+    """
+    The robot at the end of one time step.
 
     time: seconds since the trajectory's start. T_map_node: (N + 1, 4, 4). insertion: m.
     tendon_length: (K,) m; tension: (K,) N.
@@ -48,7 +50,7 @@ class Motion:
         """Fraction of the middle interval, and its duration [s]."""
         start, end = self._states[1].time, self._states[2].time
         if not start - 1e-9 <= time <= end + 1e-9:
-            raise ValueError(f"time {time} s lies outside the stored interval [{start}, {end}] s")
+            raise ValueError(f'time {time} s lies outside the stored interval [{start}, {end}] s')
         fraction = (time - start) / (end - start)
         return (0.0 if abs(fraction) < 1e-6 else fraction), end - start
 
@@ -62,11 +64,15 @@ class Motion:
             return self._states[1].T_map_node[nodes].copy()
         return self.kinematics(time, self.frames(nodes, np.eye(4)))[0]
 
-    def kinematics(self, time: float, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pose T_map_frame (F, 4, 4), body twist (F, 6) [v; w] and acceleration of the origin (F, 3) in map.
+    def kinematics(
+        self, time: float, frames: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Pose T_map_frame (F, 4, 4), body twist (F, 6) [v; w] and acceleration of the origin (F, 3)
+        in map.
 
-        `frames` are the four states of `frames()`. The acceleration is the second difference of position,
-        linear between the steps.
+        `frames` are the four states of `frames()`. The acceleration is the second difference of
+        position, linear between the steps.
         """
         u, d = self._at(time)
         twist = lie.log(lie.inverse(frames[:-1]) @ frames[1:]) / d
@@ -77,23 +83,42 @@ class Motion:
         if u == 0.0:
             return frames[1].copy(), v_a, acceleration
         xi = d * twist[1]
-        w_b = np.einsum("fij,fj->fi", lie.right_jacobian_inverse(xi), v_b)
-        gamma = u**2 * (3.0 - 2.0 * u) * xi + u * (1.0 - u)**2 * d * v_a - u**2 * (1.0 - u) * d * w_b
-        rate = 6.0 * u * (1.0 - u) * twist[1] + (1.0 - u) * (1.0 - 3.0 * u) * v_a + u * (3.0 * u - 2.0) * w_b
-        return frames[1] @ lie.exp(gamma), np.einsum("fij,fj->fi", lie.right_jacobian(gamma), rate), acceleration
+        w_b = np.einsum('fij,fj->fi', lie.right_jacobian_inverse(xi), v_b)
+        gamma = (
+            u**2 * (3.0 - 2.0 * u) * xi + u * (1.0 - u) ** 2 * d * v_a - u**2 * (1.0 - u) * d * w_b
+        )
+        rate = (
+            6.0 * u * (1.0 - u) * twist[1]
+            + (1.0 - u) * (1.0 - 3.0 * u) * v_a
+            + u * (3.0 * u - 2.0) * w_b
+        )
+        return (
+            frames[1] @ lie.exp(gamma),
+            np.einsum('fij,fj->fi', lie.right_jacobian(gamma), rate),
+            acceleration,
+        )
 
     def encoders(self, time: float) -> tuple[float, np.ndarray, np.ndarray]:
         """Insertion [m], tendon lengths (K,) [m] and tensions (K,) [N], linear between the steps."""
         u, _ = self._at(time)
         a, b = self._states[1], self._states[2]
-        return tuple((1.0 - u) * x + u * y for x, y in (
-            (a.insertion, b.insertion), (a.tendon_length, b.tendon_length), (a.tension, b.tension)))
+        return tuple(
+            (1.0 - u) * x + u * y
+            for x, y in (
+                (a.insertion, b.insertion),
+                (a.tendon_length, b.tendon_length),
+                (a.tension, b.tension),
+            )
+        )
 
 
 def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
-    """(N, 6) strain [nu; omega] of each segment: the screw that takes one node to the next, per unit of s.
+    """
+    (N, 6) strain [nu; omega] of each segment: the screw that takes one node to the next, per unit
+    of s.
 
-    For pure bending this is the constant-curvature arc that is tangent to both links at their middles.
+    For pure bending this is the constant-curvature arc that is tangent to both links at their
+    middles.
     """
     return lie.log(lie.inverse(T_map_node[:-1]) @ T_map_node[1:]) / np.diff(nodes_s)[:, None]
 
@@ -102,7 +127,9 @@ def backbone(T_map_node: np.ndarray, nodes_s: np.ndarray, s: np.ndarray) -> np.n
     """(..., 4, 4) poses T_map_backbone(s) along the arcs through the nodes; s (...) in [0, L]."""
     s = np.asarray(s, float)
     if np.any(s < nodes_s[0] - 1e-9) or np.any(s > nodes_s[-1] + 1e-9):
-        raise ValueError(f"arclength must lie in [{nodes_s[0]}, {nodes_s[-1]}] m, got {s.min()} to {s.max()}")
-    segment = np.clip(np.searchsorted(nodes_s, s, side="right") - 1, 0, len(nodes_s) - 2)
+        raise ValueError(
+            f'arclength must lie in [{nodes_s[0]}, {nodes_s[-1]}] m, got {s.min()} to {s.max()}'
+        )
+    segment = np.clip(np.searchsorted(nodes_s, s, side='right') - 1, 0, len(nodes_s) - 2)
     xi = segment_strain(T_map_node, nodes_s)[segment] * (s - nodes_s[segment])[..., None]
     return T_map_node[segment] @ lie.exp(xi)

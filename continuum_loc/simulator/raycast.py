@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-
 from continuum_loc.simulator.scene import Scene
+from numba import njit
+import numpy as np
 
 
 class RayCaster:
@@ -18,49 +17,75 @@ class RayCaster:
         self._tensor = open3d.core.Tensor
         self._embree = open3d.t.geometry.RaycastingScene(nthreads=threads)
         self._embree.add_triangles(
-            self._tensor(scene.vertices.astype(np.float32)), self._tensor(scene.faces.astype(np.uint32)))
+            self._tensor(scene.vertices.astype(np.float32)),
+            self._tensor(scene.faces.astype(np.uint32)),
+        )
         self._invalid = self._embree.INVALID_ID
 
-    def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First hits of N rays, given origins (N, 3) [m] and unit directions (N, 3) in the map frame.
+    def cast(
+        self, origins: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        First hits of N rays, given origins (N, 3) [m] and unit directions (N, 3) in the map frame.
 
-        Returns distance (N,) [m], inf where nothing is hit; face (N,) int64, -1 where nothing is hit; and the
-        unit normal (N, 3) of the face, nan where nothing is hit.
+        Returns distance (N,) [m], inf where nothing is hit; face (N,) int64, -1 where nothing is
+        hit; and the unit normal (N, 3) of the face, nan where nothing is hit.
         """
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
         hits = self._embree.cast_rays(self._tensor(rays))
-        faces = hits["primitive_ids"].numpy()
+        faces = hits['primitive_ids'].numpy()
         missed = faces == self._invalid
         faces = np.where(missed, -1, faces.astype(np.int64))
         normals = np.where(missed[:, None], np.nan, self.scene.face_normals[faces])
-        return hits["t_hit"].numpy().astype(float), faces, normals
+        return hits['t_hit'].numpy().astype(float), faces, normals
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) from points (N, 3) to the nearest surface [m], negative inside solid matter."""
-        return self._embree.compute_signed_distance(self._tensor(np.asarray(points, np.float32))).numpy().astype(float)
+        return (
+            self._embree.compute_signed_distance(self._tensor(np.asarray(points, np.float32)))
+            .numpy()
+            .astype(float)
+        )
 
 
 @njit(cache=True)
 def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndarray) -> np.ndarray:
-    """Distance (S, K) along the K unit rays of S fans to the first of M capsules, inf where none is hit.
+    """
+    Distance (S, K) along the K unit rays of S fans to the first of M capsules, inf where none is
+    hit.
 
-    origins: (S, 3). directions: (S, K, 3). Each capsule (M, 7) is ax ay az bx by bz radius: all points within
-    `radius` of the segment from a to b. A fan that starts inside a capsule (its own mount) looks through it.
+    origins: (S, 3). directions: (S, K, 3). Each capsule (M, 7) is ax ay az bx by bz radius: all
+    points within `radius` of the segment from a to b. A fan that starts inside a capsule (its own
+    mount) looks through it.
     """
     fans, rays = directions.shape[:2]
     nearest = np.full((fans, rays), np.inf)
     for i in range(fans):
         cone_axis, half_angle = _enclosing_cone(directions[i])
         for j in range(len(capsules)):
-            axis, offset, radius = capsules[j, 3:6] - capsules[j, 0:3], origins[i] - capsules[j, 0:3], capsules[j, 6]
+            axis, offset, radius = (
+                capsules[j, 3:6] - capsules[j, 0:3],
+                origins[i] - capsules[j, 0:3],
+                capsules[j, 6],
+            )
             if _outside_cone(cone_axis, half_angle, axis, offset, radius):
                 continue
-            axis_axis, axis_offset, offset_offset = _dot(axis, axis), _dot(axis, offset), _dot(offset, offset)
+            axis_axis, axis_offset, offset_offset = (
+                _dot(axis, axis),
+                _dot(axis, offset),
+                _dot(offset, offset),
+            )
             if _inside(axis_axis, axis_offset, offset_offset, radius):
                 continue
             for k in range(rays):
-                entry = _capsule_entry(axis_axis, axis_offset, offset_offset, _dot(axis, directions[i, k]),
-                                       _dot(offset, directions[i, k]), radius)
+                entry = _capsule_entry(
+                    axis_axis,
+                    axis_offset,
+                    offset_offset,
+                    _dot(axis, directions[i, k]),
+                    _dot(offset, directions[i, k]),
+                    radius,
+                )
                 nearest[i, k] = min(nearest[i, k], entry)
     return nearest
 
@@ -90,8 +115,9 @@ def _outside_cone(cone_axis, half_angle, axis, offset, radius):
     return angle > half_angle + np.arcsin(reach / distance)
 
 
-# A ray from o along unit d against a capsule from a along v needs only the products of v, w = o - a and d: below,
-# vv, vw, ww are those of the capsule and the origin, vd and wd those with the ray's direction.
+# A ray from o along unit d against a capsule from a along v needs only the products of v, w = o -
+# a and d: below, vv, vw, ww are those of the capsule and the origin, vd and wd those with the
+# ray's direction.
 
 
 @njit(cache=True)

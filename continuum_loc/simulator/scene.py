@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
-
-import numpy as np
+from typing import Literal, TYPE_CHECKING
 
 from continuum_loc.simulator.solids import mesh_of
+import numpy as np
 
 if TYPE_CHECKING:
-    from manifold3d import Manifold
-
     from continuum_loc.simulator.solids import Part
+    from manifold3d import Manifold
 
 
 class SceneError(ValueError):
@@ -22,13 +20,16 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Anomaly:
-    """What a scene has that its as-built version has not (`added`), or the other way round (`missing`).
+    """
+    What a scene has that its as-built version has not (`added`), or the other way round
+    (`missing`).
 
-    `vertices` (V, 3) and `faces` (F, 3) bound the solid that was added or taken away, in the map frame.
+    `vertices` (V, 3) and `faces` (F, 3) bound the solid that was added or taken away, in the map
+    frame.
     """
 
     name: str
-    kind: Literal["added", "missing"]
+    kind: Literal['added', 'missing']
     vertices: np.ndarray
     faces: np.ndarray
 
@@ -45,7 +46,8 @@ class Anomaly:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A watertight environment in the map frame.
+    """
+    A watertight environment in the map frame.
 
     vertices: (V, 3) float64 [m]. faces: (F, 3) int32, counter-clockwise seen from free space.
     face_object: (F,) int32, index into `objects` of the part that each face belongs to.
@@ -75,10 +77,24 @@ class Scene:
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
 
-def scene_of_solid(name: str, solid: Manifold, owners: np.ndarray, parts: list[Part],
-                   anomalies: tuple[Anomaly, ...] = ()) -> Scene:
+def scene_of_solid(
+    name: str,
+    solid: Manifold,
+    owners: np.ndarray,
+    parts: list[Part],
+    anomalies: tuple[Anomaly, ...] = (),
+) -> Scene:
     """The scene of united parts; `owners` (F,) is the index of each face's part (see `solids.unite`)."""
     vertices, faces = mesh_of(solid)
     reflectance = np.array([part.reflectance for part in parts])[owners]
     hulls = tuple(hull for part in parts for hull in part.hulls)
-    return Scene(name, vertices, faces, owners, tuple(part.name for part in parts), reflectance, hulls, anomalies)
+    return Scene(
+        name,
+        vertices,
+        faces,
+        owners,
+        tuple(part.name for part in parts),
+        reflectance,
+        hulls,
+        anomalies,
+    )

@@ -1,7 +1,9 @@
-"""Scenes by name or file.
+"""
+Scenes by name or file.
 
-`load_scene("S0")` ... `"S9"` are the engine of the paper (as built, with added objects, with missing features, with
-both), `"R0"` ... `"R4"` the box with none to four objects; anything else is the path of your own mesh.
+`load_scene("S0")` ... `"S9"` are the engine of the paper (as built, with added objects, with
+missing features, with both), `"R0"` ... `"R4"` the box with none to four objects; anything else is
+the path of your own mesh.
 """
 
 from __future__ import annotations
@@ -11,14 +13,15 @@ from pathlib import Path
 
 from continuum_loc.simulator.scene import Scene, SceneError
 
-ENGINE_SCENES = tuple(f"S{i}" for i in range(10))
-BOX_SCENES = tuple(f"R{i}" for i in range(5))
+ENGINE_SCENES = tuple(f'S{i}' for i in range(10))
+BOX_SCENES = tuple(f'R{i}' for i in range(5))
 SCENE_NAMES = ENGINE_SCENES + BOX_SCENES
-MESH_SUFFIXES = (".stl", ".obj", ".ply")
+MESH_SUFFIXES = ('.stl', '.obj', '.ply')
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
-    """A scene by name (`S0`-`S9`, `R0`-`R4`) or from a mesh file (STL, OBJ, PLY; metres, map frame).
+    """
+    A scene by name (`S0`-`S9`, `R0`-`R4`) or from a mesh file (STL, OBJ, PLY; metres, map frame).
 
     Raises SceneError for an unknown name, an unreadable file, or a mesh that is not fit for use.
     """
@@ -29,15 +32,29 @@ def load_scene(name_or_path: str | Path) -> Scene:
         from continuum_loc.simulator.mesh_import import import_mesh
 
         return import_mesh(Path(name))
-    raise SceneError(f"no scene '{name}': give one of {', '.join(SCENE_NAMES)}, or the path of a "
-                     f"{', '.join(MESH_SUFFIXES)} file")
+    raise SceneError(
+        f"no scene '{name}': give one of {', '.join(SCENE_NAMES)}, or the path of a "
+        f'{", ".join(MESH_SUFFIXES)} file'
+    )
 
 
 @lru_cache(maxsize=4)
 def _built(name: str) -> Scene:
-    from continuum_loc.simulator import box, engine_mesh, engine_variants, scene, scene_cache, solids
+    from continuum_loc.simulator import (
+        box,
+        engine_mesh,
+        engine_variants,
+        scene,
+        scene_cache,
+        solids,
+    )
 
     if name in BOX_SCENES:
         return box.box_scene(name)
-    sources = (Path(module.__file__) for module in (scene, engine_mesh, engine_variants, solids, scene_cache))
-    return scene_cache.cached_scene(name, [Path(__file__), *sources], lambda: engine_variants.engine_variant(name))
+    sources = (
+        Path(module.__file__)
+        for module in (scene, engine_mesh, engine_variants, solids, scene_cache)
+    )
+    return scene_cache.cached_scene(
+        name, [Path(__file__), *sources], lambda: engine_variants.engine_variant(name)
+    )

@@ -1,4 +1,5 @@
-"""Solids for procedurally made scenes: parts, their union into one watertight mesh,
+"""
+Solids for procedurally made scenes: parts, their union into one watertight mesh,
 and how to place them.
 
 Map frame throughout; metres. `azimuth` turns about the map's x axis, from +z (0 deg) towards +y.
@@ -8,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh64, OpType
+import numpy as np
 
 Hulls = tuple[np.ndarray, ...]
 
@@ -18,8 +19,10 @@ _ROBUST_EDGE = 1e-5  # slivers thinner than this are collapsed: single-precision
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A named solid, the convex pieces (n, 3) that stand for it in contact, and how much of a ToF
-    sensor's infrared light it reflects (0..1, at normal incidence)."""
+    """
+    A named solid, the convex pieces (n, 3) that stand for it in contact, and how much of a ToF
+    sensor's infrared light it reflects (0..1, at normal incidence).
+    """
 
     name: str
     solid: Manifold
@@ -57,9 +60,11 @@ def vertices_of(solid: Manifold) -> np.ndarray:
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
     """The solid inside a closed mesh. Raises ValueError where the mesh is not a closed, oriented surface."""
     # Copies: the binding takes no read-only arrays.
-    solid = Manifold(Mesh64(np.array(vertices, dtype=np.float64, order="C"), faces.astype(np.uint64)))
+    solid = Manifold(
+        Mesh64(np.array(vertices, dtype=np.float64, order='C'), faces.astype(np.uint64))
+    )
     if solid.is_empty():
-        raise ValueError(f"not a closed, oriented surface: {solid.status()}")
+        raise ValueError(f'not a closed, oriented surface: {solid.status()}')
     return solid
 
 
@@ -73,9 +78,13 @@ def cylinder(radius: float, height: float, segments: int = 32) -> Manifold:
     return Manifold.cylinder(height, radius, radius, segments, center=True)
 
 
-def on_cylinder(solid: Manifold, x: float, azimuth_deg: float, radius: float, turn_deg: float = 0.0) -> Manifold:
-    """Move a solid to a place on the engine's wall: its z becomes radial (outward), its x axial, its y
-    circumferential, after a turn about its own z."""
+def on_cylinder(
+    solid: Manifold, x: float, azimuth_deg: float, radius: float, turn_deg: float = 0.0
+) -> Manifold:
+    """
+    Move a solid to a place on the engine's wall: its z becomes radial (outward), its x axial, its
+    y circumferential, after a turn about its own z.
+    """
     radial = radial_direction(azimuth_deg)
     rotation = np.column_stack([[1.0, 0.0, 0.0], tangent_direction(azimuth_deg), radial])
     position = radius * radial + np.array([x, 0.0, 0.0])
@@ -100,7 +109,9 @@ def wrap(x: np.ndarray, azimuth: np.ndarray, radius: np.ndarray) -> np.ndarray:
     return np.stack([x, radius * np.sin(azimuth), radius * np.cos(azimuth)], axis=-1)
 
 
-def lathe(profile: np.ndarray, segments: int, azimuth_deg: tuple[float, float] = (-180.0, 180.0)) -> Manifold:
+def lathe(
+    profile: np.ndarray, segments: int, azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+) -> Manifold:
     """Revolve a closed profile (n, 2) of (x, r) about the map's x axis, over a range of azimuth."""
     profile = np.asarray(profile, dtype=float)
     radius_x = profile[:, ::-1]
@@ -108,20 +119,27 @@ def lathe(profile: np.ndarray, segments: int, azimuth_deg: tuple[float, float] =
         radius_x = radius_x[::-1]
     span = azimuth_deg[1] - azimuth_deg[0]
     turned = CrossSection([radius_x]).revolve(segments, span)
-    # revolve() turns from local x about local z; send (x, y, z) to the map's (y, z, x), then to the first azimuth.
+    # revolve() turns from local x about local z; send (x, y, z) to the map's (y, z, x), then to
+    # the first azimuth.
     turned = turned.transform([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
     return turned.rotate((90.0 - azimuth_deg[1], 0.0, 0.0))
 
 
 def loft(sections: np.ndarray) -> Manifold:
-    """The solid through closed sections (m, n, 3); each has n points, first half on one side and second half
-    on the other in reverse, so that point i faces point n-1-i (the caps join them)."""
+    """
+    The solid through closed sections (m, n, 3); each has n points, first half on one side and
+    second half on the other in reverse, so that point i faces point n-1-i (the caps join them).
+    """
     stations, around = sections.shape[:2]
     ring = np.arange(around)
     following = np.roll(ring, -1)
     base = np.arange(stations - 1)[:, None] * around
-    lower = np.stack([base + ring, base + following, base + around + following], axis=-1).reshape(-1, 3)
-    upper = np.stack([base + ring, base + around + following, base + around + ring], axis=-1).reshape(-1, 3)
+    lower = np.stack([base + ring, base + following, base + around + following], axis=-1).reshape(
+        -1, 3
+    )
+    upper = np.stack(
+        [base + ring, base + around + following, base + around + ring], axis=-1
+    ).reshape(-1, 3)
     cap = _cap(around)
     faces = np.concatenate([lower, upper, cap[:, ::-1], cap + (stations - 1) * around])
     return _outward(sections.reshape(-1, 3), faces)
@@ -130,12 +148,14 @@ def loft(sections: np.ndarray) -> Manifold:
 def _cap(around: int) -> np.ndarray:
     near = np.arange(around // 2 - 1)
     far = around - 1 - near
-    return np.concatenate([np.stack([near, near + 1, far - 1], axis=-1), np.stack([near, far - 1, far], axis=-1)])
+    return np.concatenate(
+        [np.stack([near, near + 1, far - 1], axis=-1), np.stack([near, far - 1, far], axis=-1)]
+    )
 
 
 def _outward(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    if np.einsum("ij,ij->", np.cross(a, b), c) < 0.0:
+    if np.einsum('ij,ij->', np.cross(a, b), c) < 0.0:
         faces = faces[:, ::-1]
     return solid_of(vertices, faces)
 

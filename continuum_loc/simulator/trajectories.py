@@ -1,8 +1,11 @@
-"""Named trajectories: tendon tensions and insertion as smooth functions of time.
+"""
+Named trajectories: tendon tensions and insertion as smooth functions of time.
 
-Each begins with one second at rest (the settled shape under the first row's tensions), which the estimator may
-use to average gyro biases; its first keyframe ends that rest. Between keyframes a monotone cubic keeps values and
-rates continuous and never overshoots a keyframe: no tension is commanded that the table does not show.
+Each begins with one second at rest (the settled shape under the first row's tensions), which the
+estimator may use to average gyro biases; its first keyframe ends that rest. Between keyframes a
+monotone cubic keeps values and
+rates continuous and never overshoots a keyframe: no tension is commanded that the table does not
+show.
 """
 
 from __future__ import annotations
@@ -10,13 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from continuum_loc.robot import RobotDescription
+from continuum_loc.settings import load_settings, Settings, SettingsError
+from continuum_loc.simulator.plant import PlantSettings
 import numpy as np
 from pydantic import Field
 from scipy.interpolate import PchipInterpolator
-
-from continuum_loc.robot import RobotDescription
-from continuum_loc.settings import Settings, SettingsError, load_settings
-from continuum_loc.simulator.plant import PlantSettings
 
 REST = 1.0  # seconds at rest at the start
 GRAVITY = 9.81
@@ -33,7 +35,9 @@ class Command:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; held before the first and after the last.
+    """
+    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; held before the first and after
+    the last.
 
     supported: the arm lies in a groove that carries its weight.
     """
@@ -48,12 +52,23 @@ class Trajectory:
     def __post_init__(self) -> None:
         values = np.column_stack([self.tensions, self.insertion])
         if self.tensions.min() < 0.0:
-            raise ValueError(f"trajectory '{self.name}': tendons only pull, got {self.tensions.min()} N")
-        if len(self.times) < 2 or np.any(np.diff(self.times) <= 0.0) or not np.all(np.isfinite(values)):
-            raise ValueError(f"trajectory '{self.name}': needs two or more finite keyframes at increasing times")
-        # One more second of the end values on either side: the motion starts and ends with zero rate.
+            raise ValueError(
+                f"trajectory '{self.name}': tendons only pull, got {self.tensions.min()} N"
+            )
+        if (
+            len(self.times) < 2
+            or np.any(np.diff(self.times) <= 0.0)
+            or not np.all(np.isfinite(values))
+        ):
+            raise ValueError(
+                f"trajectory '{self.name}': needs two or more finite keyframes at increasing times"
+            )
+        # One more second of the end values on either side: the motion starts and ends with zero
+        # rate.
         times = np.concatenate([[self.times[0] - 1.0], self.times, [self.times[-1] + 1.0]])
-        object.__setattr__(self, "_spline", PchipInterpolator(times, values[[0, *range(len(values)), -1]]))
+        object.__setattr__(
+            self, '_spline', PchipInterpolator(times, values[[0, *range(len(values)), -1]])
+        )
 
     @property
     def duration(self) -> float:
@@ -67,11 +82,12 @@ class Trajectory:
         return Command(value[:-1], float(value[-1]), float(rate[-1]))
 
 
-# Keyframes of the engine robot: time [s], insertion [m], then for each module the curvature wanted about body y
-# (positive lowers the tip) and body z (positive to the left) [1/m], beyond what holds the robot level.
+# Keyframes of the engine robot: time [s], insertion [m], then for each module the curvature wanted
+# about body y (positive lowers the tip) and body z (positive to the left) [1/m], beyond what holds
+# the robot level.
 _ENGINE = {
     # Straight in through the fans' gap, looking about on the way: slow and wide.
-    "t1": [
+    't1': [
         (1.0, 0.00, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
         (4.0, 0.12, (0.1, 0.1), (-0.2, 0.2), (-0.3, 0.4)),
         (7.0, 0.24, (0.1, -0.1), (-0.2, -0.3), (0.3, -0.8)),
@@ -81,8 +97,9 @@ _ENGINE = {
         (18.5, 0.44, (0.0, 0.0), (0.2, 0.1), (0.6, 0.2)),
         (20.0, 0.42, (0.0, 0.0), (0.0, 0.0), (0.2, 0.0)),
     ],
-    # Brisk: the tip sweeps within a second, stops, and sweeps back, between short pushes of the insertion.
-    "t2": [
+    # Brisk: the tip sweeps within a second, stops, and sweeps back, between short pushes of the
+    # insertion.
+    't2': [
         (1.0, 0.10, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
         (2.4, 0.14, (0.0, 0.1), (-0.1, 0.1), (-0.3, 0.3)),
         (3.2, 0.16, (0.0, 0.1), (-0.1, 0.1), (-0.3, 0.3)),
@@ -101,7 +118,7 @@ _ENGINE = {
         (20.0, 0.30, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
     ],
     # Deep: to the end of the travel, leaning on the blades and sliding along them.
-    "t3": [
+    't3': [
         (1.0, 0.05, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
         (4.0, 0.20, (-0.1, 0.2), (-0.2, 0.4), (-0.4, 0.4)),
         (6.5, 0.34, (-0.1, 0.3), (-0.1, 0.6), (0.2, 1.0)),
@@ -119,9 +136,11 @@ _ENGINE = {
 class Keyframe(Settings):
     """What the drives do at one time."""
 
-    time: float = Field(ge=REST, description="seconds from the start, the first of which is at rest")
+    time: float = Field(
+        ge=REST, description='seconds from the start, the first of which is at rest'
+    )
     tensions: tuple[float, ...] = Field(description="of every tendon, in the plant's order [N]")
-    insertion: float = Field(0.0, description="travel of the base [m]")
+    insertion: float = Field(0.0, description='travel of the base [m]')
 
 
 class TrajectoryFile(Settings):
@@ -131,12 +150,15 @@ class TrajectoryFile(Settings):
     supported: bool = False
 
 
-def trajectory(name: str, robot: RobotDescription, plant: PlantSettings, seed: int = 0) -> Trajectory:
-    """The named trajectory of this robot, or one of your own from a YAML file (`TrajectoryFile`).
+def trajectory(
+    name: str, robot: RobotDescription, plant: PlantSettings, seed: int = 0
+) -> Trajectory:
+    """
+    The named trajectory of this robot, or one of your own from a YAML file (`TrajectoryFile`).
 
     A seed other than 0 varies every keyframe after the rest by some percent.
     """
-    if name.endswith((".yaml", ".yml")):
+    if name.endswith(('.yaml', '.yml')):
         made = _from_file(name, plant)
     else:
         made = _bundled(name, robot, plant)
@@ -146,8 +168,10 @@ def trajectory(name: str, robot: RobotDescription, plant: PlantSettings, seed: i
 def _bundled(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
     tables = TRAJECTORIES.get(robot.name, {})
     if name not in tables:
-        raise SettingsError(f"robot '{robot.name}' has no trajectory '{name}'; give a .yaml file of your own"
-                            + (f", or one of {', '.join(tables)}" if tables else ""))
+        raise SettingsError(
+            f"robot '{robot.name}' has no trajectory '{name}'; give a .yaml file of your own"
+            + (f', or one of {", ".join(tables)}' if tables else '')
+        )
     return tables[name](name, robot, plant)
 
 
@@ -156,14 +180,20 @@ def _from_file(path: str, plant: PlantSettings) -> Trajectory:
     frames = read.keyframes
     for k, frame in enumerate(frames):
         if len(frame.tensions) != len(plant.tendon_names):
-            raise SettingsError(f"{path}: keyframes.{k}.tensions: {len(frame.tensions)} values for the plant's "
-                                f"{len(plant.tendon_names)} tendons ({', '.join(plant.tendon_names)})")
+            raise SettingsError(
+                f"{path}: keyframes.{k}.tensions: {len(frame.tensions)} values for the plant's "
+                f'{len(plant.tendon_names)} tendons ({", ".join(plant.tendon_names)})'
+            )
     try:
-        return Trajectory(Path(path).stem, np.array([frame.time for frame in frames]),
-                          np.array([frame.tensions for frame in frames]),
-                          np.array([frame.insertion for frame in frames]), read.supported)
+        return Trajectory(
+            Path(path).stem,
+            np.array([frame.time for frame in frames]),
+            np.array([frame.tensions for frame in frames]),
+            np.array([frame.insertion for frame in frames]),
+            read.supported,
+        )
     except ValueError as error:
-        raise SettingsError(f"{path}: {error}") from None
+        raise SettingsError(f'{path}: {error}') from None
 
 
 def trajectory_names(robot: RobotDescription) -> tuple[str, ...]:
@@ -175,58 +205,134 @@ def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Traject
     rows = _ENGINE[name]
     curvature = np.array([row[2:] for row in rows])  # (M, modules, 2)
     moments = plant.EI * curvature + _level_moments(robot, plant)
-    return Trajectory(name, np.array([row[0] for row in rows]), plant.tension_for_moments(moments),
-                      np.array([row[1] for row in rows]))
+    return Trajectory(
+        name,
+        np.array([row[0] for row in rows]),
+        plant.tension_for_moments(moments),
+        np.array([row[1] for row in rows]),
+    )
 
 
 def _level_moments(robot: RobotDescription, plant: PlantSettings) -> np.ndarray:
-    """(G, 2) bending moments, constant in each module, whose mean holds a level rod against its own weight.
+    """
+    (G, 2) bending moments, constant in each module, whose mean holds a level rod against its own
+    weight.
 
-    A cantilever's moment is w (L - s)^2 / 2; the mean over [a, b] is w ((L - a)^3 - (L - b)^3) / (6 (b - a)).
+    A cantilever's moment is w (L - s)^2 / 2; the mean over [a, b] is w ((L - a)^3 - (L - b)^3) /
+    (6 (b - a)).
     """
     ends = np.array([group.end for group in plant.tendons])
     starts = np.concatenate([[0.0], ends[:-1]])
     left = robot.length - np.stack([starts, ends])
-    mean = plant.mass_per_metre * GRAVITY * (left[0]**3 - left[1]**3) / (6.0 * (ends - starts))
+    mean = plant.mass_per_metre * GRAVITY * (left[0] ** 3 - left[1] ** 3) / (6.0 * (ends - starts))
     return np.stack([-mean, np.zeros_like(mean)], axis=-1)
 
 
 def _varied(base: Trajectory, rng: np.random.Generator) -> Trajectory:
     moving = base.times > REST
     scale = 1.0 + 0.05 * rng.standard_normal((len(base.times), 1)) * moving[:, None]
-    insertion = np.clip(base.insertion * (1.0 + 0.03 * rng.standard_normal(len(base.times)) * moving), 0.0, None)
+    insertion = np.clip(
+        base.insertion * (1.0 + 0.03 * rng.standard_normal(len(base.times)) * moving), 0.0, None
+    )
     return replace(base, tensions=base.tensions * scale, insertion=insertion)
 
 
-# Keyframes of the soft arm: time [s], tension of the central tendon and of the three distal ones [N].
+# Keyframes of the soft arm: time [s], tension of the central tendon and of the three distal ones
+# [N].
 _BOX = {
-    "b1": [  # slow, once round
-        (1.0, 2, 3, 3, 3), (4.0, 2, 14, 3, 3), (7.0, 3, 13, 15, 2), (10.0, 4, 2, 16, 4), (13.0, 4, 2, 13, 15),
-        (16.0, 2, 4, 2, 15), (18.5, 2, 9, 2, 6), (20.0, 2, 6, 3, 3)],
-    "b2": [  # the central tendon against the distal ones: far out on one side, then S-shapes
-        (1.0, 3, 3, 3, 3), (4.0, 24, 3, 3, 1), (6.0, 28, 4, 3, 1), (7.5, 24, 2, 1, 8), (10.0, 3, 10, 2, 2),
-        (12.0, 10, 2, 2, 14), (14.5, 16, 2, 2, 10), (17.0, 4, 3, 12, 3), (20.0, 3, 4, 4, 4)],
-    "b3": [  # brisk: within a second from side to side
-        (1.0, 2, 4, 4, 4), (2.2, 2, 14, 3, 3), (3.4, 2, 3, 12, 3), (4.6, 2, 3, 3, 14), (6.0, 8, 3, 3, 4),
-        (7.2, 3, 12, 10, 2), (8.4, 3, 2, 3, 12), (10.0, 3, 2, 3, 12), (11.2, 2, 14, 4, 2), (12.4, 10, 2, 12, 2),
-        (14.0, 2, 2, 2, 2), (15.2, 2, 10, 2, 10), (16.4, 2, 2, 14, 4), (18.0, 4, 6, 6, 6), (20.0, 2, 4, 4, 4)],
-    "b4": [  # up and down: all tendons together, then released
-        (1.0, 2, 3, 3, 3), (4.0, 5, 12, 12, 12), (6.5, 5, 16, 10, 12), (9.0, 2, 3, 3, 3), (11.5, 8, 8, 14, 12),
-        (14.0, 12, 10, 12, 16), (16.5, 4, 4, 3, 8), (18.5, 2, 10, 4, 4), (20.0, 2, 3, 3, 3)],
-    "b5": [  # wide, to the walls and against what stands on the floor
-        (1.0, 2, 3, 3, 3), (4.0, 10, 22, 2, 4), (6.5, 4, 20, 14, 1), (8.0, 1, 17, 17, 1), (9.5, 1, 13, 18, 1),
-        (11.5, 1, 2, 20, 8), (14.0, 2, 2, 5, 28), (16.5, 6, 10, 2, 24), (18.5, 4, 8, 3, 6), (20.0, 2, 4, 3, 3)],
+    'b1': [  # slow, once round
+        (1.0, 2, 3, 3, 3),
+        (4.0, 2, 14, 3, 3),
+        (7.0, 3, 13, 15, 2),
+        (10.0, 4, 2, 16, 4),
+        (13.0, 4, 2, 13, 15),
+        (16.0, 2, 4, 2, 15),
+        (18.5, 2, 9, 2, 6),
+        (20.0, 2, 6, 3, 3),
+    ],
+    'b2': [  # the central tendon against the distal ones: far out on one side, then S-shapes
+        (1.0, 3, 3, 3, 3),
+        (4.0, 24, 3, 3, 1),
+        (6.0, 28, 4, 3, 1),
+        (7.5, 24, 2, 1, 8),
+        (10.0, 3, 10, 2, 2),
+        (12.0, 10, 2, 2, 14),
+        (14.5, 16, 2, 2, 10),
+        (17.0, 4, 3, 12, 3),
+        (20.0, 3, 4, 4, 4),
+    ],
+    'b3': [  # brisk: within a second from side to side
+        (1.0, 2, 4, 4, 4),
+        (2.2, 2, 14, 3, 3),
+        (3.4, 2, 3, 12, 3),
+        (4.6, 2, 3, 3, 14),
+        (6.0, 8, 3, 3, 4),
+        (7.2, 3, 12, 10, 2),
+        (8.4, 3, 2, 3, 12),
+        (10.0, 3, 2, 3, 12),
+        (11.2, 2, 14, 4, 2),
+        (12.4, 10, 2, 12, 2),
+        (14.0, 2, 2, 2, 2),
+        (15.2, 2, 10, 2, 10),
+        (16.4, 2, 2, 14, 4),
+        (18.0, 4, 6, 6, 6),
+        (20.0, 2, 4, 4, 4),
+    ],
+    'b4': [  # up and down: all tendons together, then released
+        (1.0, 2, 3, 3, 3),
+        (4.0, 5, 12, 12, 12),
+        (6.5, 5, 16, 10, 12),
+        (9.0, 2, 3, 3, 3),
+        (11.5, 8, 8, 14, 12),
+        (14.0, 12, 10, 12, 16),
+        (16.5, 4, 4, 3, 8),
+        (18.5, 2, 10, 4, 4),
+        (20.0, 2, 3, 3, 3),
+    ],
+    'b5': [  # wide, to the walls and against what stands on the floor
+        (1.0, 2, 3, 3, 3),
+        (4.0, 10, 22, 2, 4),
+        (6.5, 4, 20, 14, 1),
+        (8.0, 1, 17, 17, 1),
+        (9.5, 1, 13, 18, 1),
+        (11.5, 1, 2, 20, 8),
+        (14.0, 2, 2, 5, 28),
+        (16.5, 6, 10, 2, 24),
+        (18.5, 4, 8, 3, 6),
+        (20.0, 2, 4, 3, 3),
+    ],
 }
 
-# The paper's grooves: curvature of the template [1/m], straight and arcs of 160 and 80 mm in diameter.
-_GROOVES = {"straight": 0.0, "groove160": 1.0 / 0.08, "groove80": 1.0 / 0.04}
+# The paper's grooves: curvature of the template [1/m], straight and arcs of 160 and 80 mm in
+# diameter.
+_GROOVES = {'straight': 0.0, 'groove160': 1.0 / 0.08, 'groove80': 1.0 / 0.04}
 
 # Keyframes of the Hall arm in free bending: time [s], curvature about body y and z [1/m].
 _FREE = {
-    "free1": [(1.0, 0, 0), (3.0, 8, 0), (5.0, 0, 10), (7.0, -10, 4), (9.0, -4, -10), (11.0, 10, -6), (14.0, 14, 6),
-              (16.0, 0, 16), (18.0, -8, 4), (20.0, 0, 0)],
-    "free2": [(1.0, 0, 0), (1.8, 10, 3), (2.6, -6, 8), (3.6, -12, -4), (4.6, 6, -10), (5.6, 6, 10), (7.0, 0, 0),
-              (8.0, 14, 0), (9.0, -14, 0), (10.0, 0, 0)],
+    'free1': [
+        (1.0, 0, 0),
+        (3.0, 8, 0),
+        (5.0, 0, 10),
+        (7.0, -10, 4),
+        (9.0, -4, -10),
+        (11.0, 10, -6),
+        (14.0, 14, 6),
+        (16.0, 0, 16),
+        (18.0, -8, 4),
+        (20.0, 0, 0),
+    ],
+    'free2': [
+        (1.0, 0, 0),
+        (1.8, 10, 3),
+        (2.6, -6, 8),
+        (3.6, -12, -4),
+        (4.6, 6, -10),
+        (5.6, 6, 10),
+        (7.0, 0, 0),
+        (8.0, 14, 0),
+        (9.0, -14, 0),
+        (10.0, 0, 0),
+    ],
 }
 
 
@@ -250,7 +356,7 @@ def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Traject
 
 
 TRAJECTORIES = {
-    "engine": dict.fromkeys(_ENGINE, _engine),
-    "soft_arm": dict.fromkeys(_BOX, _box),
-    "hall_arm": dict.fromkeys(_GROOVES, _groove) | dict.fromkeys(_FREE, _free),
+    'engine': dict.fromkeys(_ENGINE, _engine),
+    'soft_arm': dict.fromkeys(_BOX, _box),
+    'hall_arm': dict.fromkeys(_GROOVES, _groove) | dict.fromkeys(_FREE, _free),
 }

@@ -1,12 +1,16 @@
-"""What a VL53L5CX makes of the light that comes back: one perpendicular distance and a status for each zone.
+"""
+What a VL53L5CX makes of the light that comes back: one perpendicular distance and a status for
+each zone.
 
-A zone sees 4x4 sub-rays over its solid angle. Their light lies on a histogram of depth (distance along the optical
-axis); pulses nearer than the pulse's width merge, which puts mixed readings between two surfaces at an edge. The
-strongest (or nearest) pulse is reported if it is bright enough, to the millimetre. Some of a bright zone's light
-leaks into its neighbours; where the leak outshines the zone's own target, the sharpener flags it.
+A zone sees 4x4 sub-rays over its solid angle. Their light lies on a histogram of depth (distance
+along the optical axis); pulses nearer than the pulse's width merge, which puts mixed readings
+between two surfaces at an edge. The strongest (or nearest) pulse is reported if it is bright
+enough, to the millimetre. Some of a bright zone's light leaks into its neighbours; where the leak
+outshines the zone's own target, the sharpener flags it.
 
-Signal is relative to a white, perpendicular target that fills the zone at 1 m: reflectance * cosine / distance^2.
-The threshold reproduces the datasheet's reach: 4 m on white (88 %) and about 1.7 m on grey (17 %), both in the dark.
+Signal is relative to a white, perpendicular target that fills the zone at 1 m: reflectance *
+cosine / distance^2. The threshold reproduces the datasheet's reach: 4 m on white (88 %) and about
+1.7 m on grey (17 %), both in the dark.
 """
 
 from __future__ import annotations
@@ -14,14 +18,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-import numpy as np
-from numba import njit
-from pydantic import Field
-
 from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID
 from continuum_loc.robot import TofModel
 from continuum_loc.settings import Settings
-from continuum_loc.simulator.tof import TOF_TOO_CLOSE, Echoes, Readings
+from continuum_loc.simulator.tof import Echoes, Readings, TOF_TOO_CLOSE
+from numba import njit
+import numpy as np
+from pydantic import Field
 
 # Target status of the driver (see also measurements.py).
 STATUS_FAINT, STATUS_FIRST, STATUS_WIDE_PULSE, STATUS_NEW_TARGET = 4, 6, 9, 10
@@ -34,16 +37,22 @@ _MILLIMETRE = 1e-3
 class Vl53l5cxSettings(Settings):
     """How the sensor departs from ideal."""
 
-    sub_rays: int = Field(4, ge=1, le=16, description="sub-rays along each side of a zone")
-    target_order: Literal["strongest", "closest"] = "strongest"
-    pulse_width: float = Field(0.15, gt=0.0, description="depth within which returns merge [m]")
-    threshold: float = Field(0.055, gt=0.0, description="least signal that makes a target")
-    fluctuation: float = Field(0.1, ge=0.0, description="relative noise of the signal (1 sigma)")
-    crosstalk: float = Field(0.01, ge=0.0, lt=1.0, description="share of a zone's light that reaches each neighbour")
-    noise_floor: float = Field(0.002, ge=0.0, description="noise beside Table I [m]")
-    wide_pulse: float = Field(0.03, gt=0.0, description="spread of depth in a zone that earns status 9 [m]")
-    dropout: float = Field(0.002, ge=0.0, le=1.0, description="probability that a zone reports no target")
-    inconsistent: float = Field(0.001, ge=0.0, le=1.0, description="probability of status 13")
+    sub_rays: int = Field(4, ge=1, le=16, description='sub-rays along each side of a zone')
+    target_order: Literal['strongest', 'closest'] = 'strongest'
+    pulse_width: float = Field(0.15, gt=0.0, description='depth within which returns merge [m]')
+    threshold: float = Field(0.055, gt=0.0, description='least signal that makes a target')
+    fluctuation: float = Field(0.1, ge=0.0, description='relative noise of the signal (1 sigma)')
+    crosstalk: float = Field(
+        0.01, ge=0.0, lt=1.0, description="share of a zone's light that reaches each neighbour"
+    )
+    noise_floor: float = Field(0.002, ge=0.0, description='noise beside Table I [m]')
+    wide_pulse: float = Field(
+        0.03, gt=0.0, description='spread of depth in a zone that earns status 9 [m]'
+    )
+    dropout: float = Field(
+        0.002, ge=0.0, le=1.0, description='probability that a zone reports no target'
+    )
+    inconsistent: float = Field(0.001, ge=0.0, le=1.0, description='probability of status 13')
 
 
 class Vl53l5cxReceiver:
@@ -67,8 +76,11 @@ class Vl53l5cxReceiver:
         status = self._status(depth, signal, spread, blurred, uniform, self._memory(names))
         self._had_target.update(zip(names, status != TOF_NO_TARGET, strict=True))
         measured = np.isin(status, _MEASURED)
-        ranges = np.select([measured, status == TOF_NO_TARGET, depth < self._model.min_range],
-                           [depth / self._zone_cosine, np.inf, -np.inf], np.nan)
+        ranges = np.select(
+            [measured, status == TOF_NO_TARGET, depth < self._model.min_range],
+            [depth / self._zone_cosine, np.inf, -np.inf],
+            np.nan,
+        )
         stated = np.maximum(np.round(sigma / _MILLIMETRE), 1.0) * _MILLIMETRE / self._zone_cosine
         return Readings(ranges, np.where(measured, stated, np.nan), status)
 
@@ -82,14 +94,26 @@ class Vl53l5cxReceiver:
         brightness = np.where(seen, echoes.brightness.reshape(-1, sub_rays), 0.0)
         signal = brightness / np.maximum(filled, 1e-3) ** 2 / sub_rays
         settings = self._settings
-        targets = _targets(depth, signal, settings.pulse_width, settings.threshold, settings.target_order == "closest")
+        targets = _targets(
+            depth,
+            signal,
+            settings.pulse_width,
+            settings.threshold,
+            settings.target_order == 'closest',
+        )
         return tuple(target.reshape(-1, zones) for target in targets)
 
-    def _leak(self, depth: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth and signal (S, Z) with the light of the brightest neighbour mixed in, and where it drowns the zone's
-        own target."""
+    def _leak(
+        self, depth: np.ndarray, signal: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Depth and signal (S, Z) with the light of the brightest neighbour mixed in, and where it
+        drowns the zone's own target.
+        """
         shape = (len(depth), self._model.rows, self._model.columns)
-        neighbour_signal, neighbour_depth = _brightest_neighbour(signal.reshape(shape), depth.reshape(shape))
+        neighbour_signal, neighbour_depth = _brightest_neighbour(
+            signal.reshape(shape), depth.reshape(shape)
+        )
         leak = self._settings.crosstalk * neighbour_signal.reshape(depth.shape)
         leak_depth = neighbour_depth.reshape(depth.shape)
         merging = (signal > 0.0) & (np.abs(leak_depth - depth) < self._settings.pulse_width)
@@ -107,14 +131,34 @@ class Vl53l5cxReceiver:
     def _status(self, depth, signal, spread, blurred, uniform, before) -> np.ndarray:
         """Target status (S, Z), the gravest first."""
         settings, model = self._settings, self._model
-        none = (signal < settings.threshold) | (depth > model.max_range) | (uniform < settings.dropout)
+        none = (
+            (signal < settings.threshold)
+            | (depth > model.max_range)
+            | (uniform < settings.dropout)
+        )
         inconsistent = uniform > 1.0 - settings.inconsistent
         faint = signal < 1.15 * settings.threshold
         known = before >= 0
-        conditions = [none, depth < model.min_range, blurred, inconsistent, faint, ~known, before == 0,
-                      spread > settings.wide_pulse]
-        statuses = [TOF_NO_TARGET, TOF_TOO_CLOSE, STATUS_BLURRED, STATUS_INCONSISTENT, STATUS_FAINT, STATUS_FIRST,
-                    STATUS_NEW_TARGET, STATUS_WIDE_PULSE]
+        conditions = [
+            none,
+            depth < model.min_range,
+            blurred,
+            inconsistent,
+            faint,
+            ~known,
+            before == 0,
+            spread > settings.wide_pulse,
+        ]
+        statuses = [
+            TOF_NO_TARGET,
+            TOF_TOO_CLOSE,
+            STATUS_BLURRED,
+            STATUS_INCONSISTENT,
+            STATUS_FAINT,
+            STATUS_FIRST,
+            STATUS_NEW_TARGET,
+            STATUS_WIDE_PULSE,
+        ]
         return np.select(conditions, statuses, TOF_VALID).astype(np.uint8)
 
     def _memory(self, names: Sequence[str]) -> np.ndarray:
@@ -126,9 +170,13 @@ class Vl53l5cxReceiver:
 def _sub_directions(model: TofModel, sub_rays: int) -> np.ndarray:
     """(Z, sub_rays^2, 3) unit rays, evenly over each zone's share of the field of view."""
     rows, columns = model.rows, model.columns
-    fine = TofModel.model_validate(model.model_dump() | {"rows": rows * sub_rays, "columns": columns * sub_rays})
+    fine = TofModel.model_validate(
+        model.model_dump() | {'rows': rows * sub_rays, 'columns': columns * sub_rays}
+    )
     grid = fine.directions.reshape(rows, sub_rays, columns, sub_rays, 3)
-    return np.ascontiguousarray(grid.transpose(0, 2, 1, 3, 4).reshape(rows * columns, sub_rays**2, 3))
+    return np.ascontiguousarray(
+        grid.transpose(0, 2, 1, 3, 4).reshape(rows * columns, sub_rays**2, 3)
+    )
 
 
 def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,16 +185,20 @@ def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndar
     margin = ((0, 0), (1, 1), (1, 1))
     padded = np.pad(signal, margin), np.pad(depth, margin)
     shifts = [(r, c) for r in range(3) for c in range(3) if (r, c) != (1, 1)]
-    around = [np.stack([grid[:, r : r + rows, c : c + columns] for r, c in shifts]) for grid in padded]
+    around = [
+        np.stack([grid[:, r : r + rows, c : c + columns] for r, c in shifts]) for grid in padded
+    ]
     brightest = np.argmax(around[0], axis=0)[None]
     return tuple(np.take_along_axis(grid, brightest, axis=0)[0] for grid in around)
 
 
 @njit(cache=True)
 def _targets(depth, signal, width, threshold, closest):
-    """Depth, signal and spread (N,) of the reported pulse among K returns (N, K) of each zone.
+    """
+    Depth, signal and spread (N,) of the reported pulse among K returns (N, K) of each zone.
 
-    A pulse is centred on a return and gathers its neighbours in depth with weight (1 - (dz / width)^2)^2.
+    A pulse is centred on a return and gathers its neighbours in depth with weight (1 - (dz /
+    width)^2)^2.
     """
     count, returns = depth.shape
     best_depth, best_signal, best_spread = np.zeros(count), np.zeros(count), np.zeros(count)
@@ -154,7 +206,10 @@ def _targets(depth, signal, width, threshold, closest):
         nearest = np.inf
         if closest:
             for j in range(returns):
-                if depth[i, j] < nearest and _gather(depth[i], signal[i], depth[i, j], width)[0] >= threshold:
+                if (
+                    depth[i, j] < nearest
+                    and _gather(depth[i], signal[i], depth[i, j], width)[0] >= threshold
+                ):
                     nearest = depth[i, j]
         for j in range(returns):
             if signal[i, j] <= 0.0 or depth[i, j] > nearest + width:

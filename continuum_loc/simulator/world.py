@@ -1,4 +1,6 @@
-"""The simulated world: a robot in a scene, driven along a trajectory, and every sensor's samples with the truth.
+"""
+The simulated world: a robot in a scene, driven along a trajectory, and every sensor's samples with
+the truth.
 
     world = World(load_robot("engine"), load_scene("S0"), "t1")
     for sample in world.run(20.0):
@@ -9,22 +11,28 @@ Samples come in the order of their stamps. The same seed gives the same samples,
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import heapq
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
-import numpy as np
-
-from continuum_loc.measurements import NANOSECONDS, Measurement, TruthSample
+from continuum_loc.measurements import Measurement, NANOSECONDS, TruthSample
 from continuum_loc.robot import RobotDescription, Sensor
 from continuum_loc.settings import SettingsError
 from continuum_loc.simulator import sensors as models
-from continuum_loc.simulator.model import GRAVITY, NODE_PREFIX, advance, build_model, carriage_damping, settle
-from continuum_loc.simulator.motion import Motion, State, backbone, segment_strain
-from continuum_loc.simulator.plant import PlantSettings, load_plant, node_arclengths
+from continuum_loc.simulator.model import (
+    advance,
+    build_model,
+    carriage_damping,
+    GRAVITY,
+    NODE_PREFIX,
+    settle,
+)
+from continuum_loc.simulator.motion import backbone, Motion, segment_strain, State
+from continuum_loc.simulator.plant import load_plant, node_arclengths, PlantSettings
 from continuum_loc.simulator.trajectories import Trajectory, trajectory
+import numpy as np
 
 if TYPE_CHECKING:
     from continuum_loc.simulator.scene import Scene
@@ -44,7 +52,8 @@ class _Stream:
 
 
 class World:
-    """A robot, a scene and a trajectory; `run` simulates them from rest.
+    """
+    A robot, a scene and a trajectory; `run` simulates them from rest.
 
     plant: PlantSettings, a name or a YAML file; None takes the bundled plant of the robot's name.
     trajectory: a name of `trajectories.trajectory`, or a Trajectory.
@@ -52,10 +61,26 @@ class World:
     faults: wrappers of `faults`, applied to the stream in order.
     """
 
-    def __init__(self, robot: RobotDescription, scene: Scene | None, trajectory: str | Trajectory, *,
-                 plant: PlantSettings | str | Path | None = None, profile: str = "live", tof_fidelity: str = "paper",
-                 seed: int = 0, faults: tuple = (), start_stamp: int = DEFAULT_START) -> None:
-        self.robot, self.scene, self.seed, self.faults, self.start_stamp = robot, scene, seed, faults, start_stamp
+    def __init__(
+        self,
+        robot: RobotDescription,
+        scene: Scene | None,
+        trajectory: str | Trajectory,
+        *,
+        plant: PlantSettings | str | Path | None = None,
+        profile: str = 'live',
+        tof_fidelity: str = 'paper',
+        seed: int = 0,
+        faults: tuple = (),
+        start_stamp: int = DEFAULT_START,
+    ) -> None:
+        self.robot, self.scene, self.seed, self.faults, self.start_stamp = (
+            robot,
+            scene,
+            seed,
+            faults,
+            start_stamp,
+        )
         self.plant = plant if isinstance(plant, PlantSettings) else load_plant(plant or robot.name)
         self.trajectory = _resolve(trajectory, robot, self.plant)
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
@@ -65,7 +90,9 @@ class World:
         self.motion = Motion()
 
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
-        """Samples of the first `duration` seconds (default: the trajectory's), in the order of their stamps.
+        """
+        Samples of the first `duration` seconds (default: the trajectory's), in the order of their
+        stamps.
 
         Every call starts again from rest. Raises model.SimulationDiverged.
         """
@@ -84,7 +111,9 @@ class World:
         for state in self.body.resting_states():
             self.motion.append(state)
         streams = self._streams()
-        for stamp, _, stream in heapq.merge(*(_instants(i, s.rate, duration) for i, s in enumerate(streams))):
+        for stamp, _, stream in heapq.merge(
+            *(_instants(i, s.rate, duration) for i, s in enumerate(streams))
+        ):
             self._now = stamp / NANOSECONDS
             while not self.motion.covers(self._now):
                 self.motion.append(self.body.step())
@@ -94,9 +123,13 @@ class World:
         """Sensors in a fixed order, each with its own random stream."""
         robot, generators = self.robot, _generators(self.seed)
         streams = [_Stream(TRUTH_RATE, self._truth), self._encoder_stream(next(generators))]
-        for present, make in ((robot.imu, self._imu_stream), (robot.strain, self._strain_stream),
-                              (robot.hall, self._hall_stream), (robot.trackers, self._tracker_stream),
-                              (robot.tof and self.scene, self._tof_stream)):
+        for present, make in (
+            (robot.imu, self._imu_stream),
+            (robot.strain, self._strain_stream),
+            (robot.hall, self._hall_stream),
+            (robot.trackers, self._tracker_stream),
+            (robot.tof and self.scene, self._tof_stream),
+        ):
             rng = next(generators)
             if present:
                 streams.append(make(rng))
@@ -107,22 +140,33 @@ class World:
         return [TruthSample(stamp, self.motion.pose(time, np.concatenate([[0], rings])))]
 
     def _encoder_stream(self, rng: np.random.Generator) -> _Stream:
-        moves = self.robot.base.insertion.mode == "measured"
-        model = models.Encoders(self.plant.tendon_names, self.body.straight_length, ENCODER_SIGMA,
-                                self.robot.base.insertion.sigma if moves else None, rng)
-        return _Stream(ENCODER_RATE, lambda stamp, time: [model.measure(stamp, *self.motion.encoders(time))])
+        moves = self.robot.base.insertion.mode == 'measured'
+        model = models.Encoders(
+            self.plant.tendon_names,
+            self.body.straight_length,
+            ENCODER_SIGMA,
+            self.robot.base.insertion.sigma if moves else None,
+            rng,
+        )
+        return _Stream(
+            ENCODER_RATE, lambda stamp, time: [model.measure(stamp, *self.motion.encoders(time))]
+        )
 
     def _imu_stream(self, rng: np.random.Generator) -> _Stream:
         model = models.ImuSensors(self.robot.imu_model, self.robot.imu, GRAVITY, rng)
         nodes, mounts = self._mounts(self.robot.imu)
 
         def sample(stamp: int, time: float) -> list:
-            return model.measure(stamp, *self.motion.kinematics(time, self.motion.frames(nodes, mounts)))
+            return model.measure(
+                stamp, *self.motion.kinematics(time, self.motion.frames(nodes, mounts))
+            )
 
         return _Stream(self.robot.imu_model.rate, sample)
 
     def _strain_stream(self, rng: np.random.Generator) -> _Stream:
-        model = models.StrainSensor(self.robot.strain, self.robot.strain_stations, self.nodes_s, rng)
+        model = models.StrainSensor(
+            self.robot.strain, self.robot.strain_stations, self.nodes_s, rng
+        )
 
         def sample(stamp: int, time: float) -> list:
             return [model.measure(stamp, segment_strain(self.motion.pose(time), self.nodes_s))]
@@ -131,7 +175,9 @@ class World:
 
     def _hall_stream(self, rng: np.random.Generator) -> _Stream:
         magnet = self.robot.magnet
-        model = models.HallSensors(self.robot.hall_model, self.robot.hall, magnet, self.plant.earth_field, rng)
+        model = models.HallSensors(
+            self.robot.hall_model, self.robot.hall, magnet, self.plant.earth_field, rng
+        )
         pose = self._posed(self.robot.hall)
 
         def sample(stamp: int, time: float) -> list:
@@ -162,10 +208,12 @@ class World:
     def _capsules(self, time: float) -> np.ndarray:
         """(M, 7) ends and radius of the body's pieces, as `raycast.cast_capsules` takes them."""
         points = self.motion.pose(time)[:, :3, 3]
-        return np.column_stack([points[:-1], points[1:], np.full(len(points) - 1, self.robot.radius)])
+        return np.column_stack(
+            [points[:-1], points[1:], np.full(len(points) - 1, self.robot.radius)]
+        )
 
     def _posed(self, sensors: tuple[Sensor, ...]) -> Callable[[float], np.ndarray]:
-        """time [s] -> (F, 4, 4) true poses T_map_sensor."""
+        """Time [s] -> (F, 4, 4) true poses T_map_sensor."""
         nodes, mounts = self._mounts(sensors)
         return lambda time: self.motion.pose(time, nodes) @ mounts
 
@@ -179,13 +227,19 @@ class World:
 class _Body:
     """MuJoCo's side: drives in, states out."""
 
-    def __init__(self, robot: RobotDescription, plant: PlantSettings, model: Any, path: Trajectory) -> None:
+    def __init__(
+        self, robot: RobotDescription, plant: PlantSettings, model: Any, path: Trajectory
+    ) -> None:
         import mujoco
 
         self._mujoco, self.model, self.data, self.path = mujoco, model, mujoco.MjData(model), path
-        self._nodes = np.array([i for i in range(model.nbody) if model.body(i).name.startswith(NODE_PREFIX)])
-        self._slides = robot.base.insertion.mode != "fixed"
-        self._lead = carriage_damping(plant) / plant.carriage_stiffness  # s: cancels the drag of the drive's damping
+        self._nodes = np.array(
+            [i for i in range(model.nbody) if model.body(i).name.startswith(NODE_PREFIX)]
+        )
+        self._slides = robot.base.insertion.mode != 'fixed'
+        self._lead = (
+            carriage_damping(plant) / plant.carriage_stiffness
+        )  # s: cancels the drag of the drive's damping
         mujoco.mj_forward(model, self.data)
         self.straight_length = self.data.ten_length.copy()
         self._steps = 0
@@ -204,13 +258,22 @@ class _Body:
     def resting_states(self) -> list[State]:
         """The states at -1, 0 and +1 steps: motion is defined from time 0 on."""
         first = self.step()
-        before = State(-self.model.opt.timestep, first.T_map_node, first.insertion, first.tendon_length, first.tension)
+        before = State(
+            -self.model.opt.timestep,
+            first.T_map_node,
+            first.insertion,
+            first.tendon_length,
+            first.tension,
+        )
         return [before, first, self.step()]
 
     def step(self) -> State:
-        """The state at the next step's beginning; then the drives' new command acts and the step is taken.
+        """
+        The state at the next step's beginning; then the drives' new command acts and the step is
+        taken.
 
-        MuJoCo's derived quantities after a step still belong to its beginning, so no extra kinematics are needed.
+        MuJoCo's derived quantities after a step still belong to its beginning, so no extra
+        kinematics are needed.
         """
         time = self._steps * self.model.opt.timestep
         self._command(time)
@@ -238,7 +301,7 @@ class _Body:
 
     def _insertion(self, T_map_node: np.ndarray) -> float:
         """Travel of the base along its own axis [m], from the same kinematics as the poses."""
-        base = self.model.body("carriage")
+        base = self.model.body('carriage')
         R = np.zeros(9)
         self._mujoco.mju_quat2Mat(R, base.quat)
         return float((T_map_node[0, :3, 3] - base.pos) @ R.reshape(3, 3)[:, 0])
@@ -248,12 +311,16 @@ def _resolve(path: str | Trajectory, robot: RobotDescription, plant: PlantSettin
     path = trajectory(path, robot, plant) if isinstance(path, str) else path
     tendons = len(plant.tendon_names)
     if path.tensions.shape[1] != tendons:
-        raise SettingsError(f"trajectory '{path.name}' drives {path.tensions.shape[1]} tendons, "
-                            f"the plant has {tendons}")
+        raise SettingsError(
+            f"trajectory '{path.name}' drives {path.tensions.shape[1]} tendons, "
+            f'the plant has {tendons}'
+        )
     least, most = robot.base.insertion.range
     if path.insertion.min() < least - 1e-9 or path.insertion.max() > most + 1e-9:
-        raise SettingsError(f"trajectory '{path.name}' inserts {path.insertion.min()} to {path.insertion.max()} m; "
-                            f"robot '{robot.name}' can travel {least} to {most} m")
+        raise SettingsError(
+            f"trajectory '{path.name}' inserts {path.insertion.min()} to {path.insertion.max()} m; "
+            f"robot '{robot.name}' can travel {least} to {most} m"
+        )
     return path
 
 

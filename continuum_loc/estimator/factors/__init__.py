@@ -10,7 +10,13 @@ from continuum_loc.estimator.factors.pose import InsertionFactor, TrackerFactor
 from continuum_loc.estimator.factors.strain import StrainFactor
 from continuum_loc.estimator.factors.tof import TofFactor
 
-FACTORS: tuple[type[Factor], ...] = (GyroFactor, StrainFactor, TrackerFactor, InsertionFactor, GravityFactor,
-                                    FieldFactor)
+FACTORS: tuple[type[Factor], ...] = (
+    GyroFactor,
+    StrainFactor,
+    TrackerFactor,
+    InsertionFactor,
+    GravityFactor,
+    FieldFactor,
+)
 
-__all__ = ["FACTORS", "Factor", "FactorReport", "MeasurementError", "TofFactor"]
+__all__ = ['FACTORS', 'Factor', 'FactorReport', 'MeasurementError', 'TofFactor']

@@ -1,8 +1,10 @@
-"""The contract that every sensor's factor keeps; a new sensor is one file beside this one and an entry in FACTORS.
+"""
+The contract that every sensor's factor keeps; a new sensor is one file beside this one and an
+entry in FACTORS.
 
-A factor turns a measurement into a *row* when it arrives (a tuple of floats and arrays, in the body frame of its
-node), stacks the rows of an interval into arrays once, and adds their normal equations to the interval's blocks
-each time that the interval is linearised.
+A factor turns a measurement into a *row* when it arrives (a tuple of floats and arrays, in the
+body frame of its node), stacks the rows of an interval into arrays once, and adds their normal
+equations to the interval's blocks each time that the interval is linearised.
 """
 
 from __future__ import annotations
@@ -11,12 +13,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import numpy as np
-
 from continuum_loc.estimator.chain import Blocks
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
 from continuum_loc.robot import RobotDescription
+import numpy as np
 
 
 class MeasurementError(ValueError):
@@ -29,8 +30,10 @@ class MeasurementError(ValueError):
 
 @dataclass(slots=True)
 class FactorReport:
-    """How an interval's measurements of one kind fit: robust cost, sum of squared normalised residuals and their
-    number, and for each sensor its [usable, fitting] counts."""
+    """
+    How an interval's measurements of one kind fit: robust cost, sum of squared normalised
+    residuals and their number, and for each sensor its [usable, fitting] counts.
+    """
 
     cost: float = 0.0
     squared: float = 0.0
@@ -71,7 +74,9 @@ class Repeats:
     def frozen(self, sensor: str, values: np.ndarray) -> bool:
         """Note a sample; True when the sensor has repeated itself too often."""
         data = np.ascontiguousarray(values).tobytes()
-        self._count[sensor] = self._count.get(sensor, 0) + 1 if self._last.get(sensor) == data else 0
+        self._count[sensor] = (
+            self._count.get(sensor, 0) + 1 if self._last.get(sensor) == data else 0
+        )
         self._last[sensor] = data
         return self._count[sensor] > self._most
 
@@ -79,7 +84,9 @@ class Repeats:
 def require_finite(values: np.ndarray, what: str, sensor: str) -> None:
     """Raise MeasurementError unless every value is finite."""
     if not np.all(np.isfinite(values)):
-        raise MeasurementError("not finite", f"{what} of '{sensor}' is not finite: {np.asarray(values).tolist()}")
+        raise MeasurementError(
+            'not finite', f"{what} of '{sensor}' is not finite: {np.asarray(values).tolist()}"
+        )
 
 
 def known_sensor(sensors: dict[str, Any], name: str, kind: str) -> Any:
@@ -87,5 +94,7 @@ def known_sensor(sensors: dict[str, Any], name: str, kind: str) -> Any:
     try:
         return sensors[name]
     except KeyError:
-        raise MeasurementError("unknown frame", f"{kind} frame '{name}' is not in the robot description; valid: "
-                                                f"{', '.join(sensors)}") from None
+        raise MeasurementError(
+            'unknown frame',
+            f"{kind} frame '{name}' is not in the robot description; valid: {', '.join(sensors)}",
+        ) from None

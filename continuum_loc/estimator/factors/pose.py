@@ -1,51 +1,85 @@
-"""Measured poses of a node: an external tracker's, and the insertion encoder's pose of the base.
+"""
+Measured poses of a node: an external tracker's, and the insertion encoder's pose of the base.
 
 e = Log(T_measured^-1 T), J = J_r(e)^-1 for a right perturbation.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, known_sensor, require_finite
+from continuum_loc.estimator.factors.base import (
+    Factor,
+    FactorReport,
+    known_sensor,
+    MeasurementError,
+    require_finite,
+)
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.measurements import EncoderSample, TrackedPose
+from numba import njit
+import numpy as np
 
 
 class _PoseFactor(Factor):
     cauchy = np.inf
 
     def stack(self, times, rows):
-        return times, np.array([row[0] for row in rows]), np.array([row[1] for row in rows]), np.array(
-            [row[2] for row in rows])
+        return (
+            times,
+            np.array([row[0] for row in rows]),
+            np.array([row[1] for row in rows]),
+            np.array([row[2] for row in rows]),
+        )
 
     def linearise(self, batch, a, b, blocks):
         times, nodes, T_map_measured, information = batch
-        cost, squared = _add(blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, b.time - a.time, times, nodes,
-                             T_map_measured, information, self.cauchy)
-        return FactorReport(cost, squared, int(np.sum(np.diagonal(information, axis1=1, axis2=2) > 0.0)))
+        cost, squared = _add(
+            blocks.H,
+            blocks.g,
+            a.T,
+            a.velocity,
+            b.T,
+            b.velocity,
+            b.time - a.time,
+            times,
+            nodes,
+            T_map_measured,
+            information,
+            self.cauchy,
+        )
+        return FactorReport(
+            cost, squared, int(np.sum(np.diagonal(information, axis1=1, axis2=2) > 0.0))
+        )
 
 
 class TrackerFactor(_PoseFactor):
     """Pose of a sensor from an external tracker (EM, motion capture)."""
 
-    name = "tracker"
+    name = 'tracker'
     consumes = TrackedPose
 
     def __init__(self, robot, grid, settings):
         super().__init__(robot, grid, settings)
         self.cauchy = settings.tracker.cauchy
-        self._sensors = {sensor.name: (grid.node_at(robot.sensor_arclength(sensor.name)),
-                                       lie.inverse(sensor.mount.T_ring_sensor)) for sensor in robot.trackers}
-        self._default = np.array([settings.tracker.sigma_position] * 3
-                                 + [np.radians(settings.tracker.sigma_rotation_deg)] * 3) ** -2.0
+        self._sensors = {
+            sensor.name: (
+                grid.node_at(robot.sensor_arclength(sensor.name)),
+                lie.inverse(sensor.mount.T_ring_sensor),
+            )
+            for sensor in robot.trackers
+        }
+        self._default = (
+            np.array(
+                [settings.tracker.sigma_position] * 3
+                + [np.radians(settings.tracker.sigma_rotation_deg)] * 3
+            )
+            ** -2.0
+        )
 
     def row(self, measurement: TrackedPose) -> tuple:
-        node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, "tracker")
-        require_finite(measurement.T_map_sensor, "pose", measurement.sensor)
+        node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, 'tracker')
+        require_finite(measurement.T_map_sensor, 'pose', measurement.sensor)
         Ad = lie.adjoint(lie.inverse(T_sensor_ring))  # sensor-frame covariance to the ring's frame
         information = np.diag(self._default)
         if np.any(measurement.covariance):
@@ -53,28 +87,38 @@ class TrackerFactor(_PoseFactor):
                 information = np.linalg.inv(Ad @ measurement.covariance @ Ad.T)
                 np.linalg.cholesky(information)
             except np.linalg.LinAlgError:
-                raise MeasurementError("bad covariance", f"covariance of '{measurement.sensor}' is not positive "
-                                                         "definite") from None
+                raise MeasurementError(
+                    'bad covariance',
+                    f"covariance of '{measurement.sensor}' is not positive definite",
+                ) from None
         return node, measurement.T_map_sensor @ T_sensor_ring, information
 
 
 class InsertionFactor(_PoseFactor):
     """Base travel along its own x axis, from the joint state `insertion`."""
 
-    name = "insertion"
+    name = 'insertion'
     consumes = EncoderSample
 
     def row(self, measurement: EncoderSample) -> tuple:
         insertion = self.robot.base.insertion
-        if insertion.mode != "measured":
-            raise MeasurementError("not used", f"insertion is '{insertion.mode}' in the robot description")
-        if "insertion" not in measurement.names:
-            raise MeasurementError("not used", f"no joint 'insertion' among {', '.join(measurement.names)}")
-        travel = float(measurement.position[measurement.names.index("insertion")])
-        require_finite(np.array(travel), "insertion", "joint_states")
+        if insertion.mode != 'measured':
+            raise MeasurementError(
+                'not used', f"insertion is '{insertion.mode}' in the robot description"
+            )
+        if 'insertion' not in measurement.names:
+            raise MeasurementError(
+                'not used', f"no joint 'insertion' among {', '.join(measurement.names)}"
+            )
+        travel = float(measurement.position[measurement.names.index('insertion')])
+        require_finite(np.array(travel), 'insertion', 'joint_states')
         information = np.zeros((6, 6))
         information[0, 0] = insertion.sigma**-2.0
-        return 0, self.robot.base.T_map_base @ lie.exp(np.array([travel, 0, 0, 0, 0, 0])), information
+        return (
+            0,
+            self.robot.base.T_map_base @ lie.exp(np.array([travel, 0, 0, 0, 0, 0])),
+            information,
+        )
 
 
 @njit(cache=True)
@@ -88,7 +132,9 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, T_measured, information, ca
     cost, squared = 0.0, 0.0
     for m in range(times.shape[0]):
         n = nodes[m]
-        gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
+        gp.hermite(
+            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work
+        )
         lie_kernels.relative(T_measured[m], T, M[0])
         lie_kernels.log(M[0], e)
         lie_kernels.ad(e, W[0])
@@ -110,6 +156,10 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, T_measured, information, ca
                     local[i, j] += robust * J[k, i] * W[0, k, j]
         gp.time_index(n, VELOCITY, size, index)
         gp.add_local(H, g, index, local, slope, J_pose, work)
-        cost += 0.5 * u2 if np.isinf(cauchy) else 0.5 * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
+        cost += (
+            0.5 * u2
+            if np.isinf(cauchy)
+            else 0.5 * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
+        )
         squared += u2 * robust
     return cost, squared

@@ -1,39 +1,52 @@
-"""FBG-like strain (paper eqs. 7-9), masked to the two curvatures that (theta, kappa) really measures.
+"""
+FBG-like strain (paper eqs. 7-9), masked to the two curvatures that (theta, kappa) really measures.
 
-The measured bending is kappa (-sin theta, cos theta). Its noise is sigma_kappa along it and kappa sigma_theta across;
-a nearly straight station says nothing about theta, so the latter never falls below sigma_kappa.
+The measured bending is kappa (-sin theta, cos theta). Its noise is sigma_kappa along it and kappa
+sigma_theta across; a nearly straight station says nothing about theta, so the latter never falls
+below sigma_kappa.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, require_finite
+from continuum_loc.estimator.factors.base import (
+    Factor,
+    FactorReport,
+    MeasurementError,
+    require_finite,
+)
 from continuum_loc.estimator.state import NODE_DIM, STRAIN
 from continuum_loc.measurements import StrainSample
+from numba import njit
+import numpy as np
 
 
 class StrainFactor(Factor):
     """Bending strain at any number of stations, interpolated in arclength at both knots and linearly in time."""
 
-    name = "strain"
+    name = 'strain'
     consumes = StrainSample
 
     def row(self, measurement: StrainSample) -> tuple:
         if self.robot.strain is None:
-            raise MeasurementError("unknown frame", f"robot '{self.robot.name}' has no strain sensor")
+            raise MeasurementError(
+                'unknown frame', f"robot '{self.robot.name}' has no strain sensor"
+            )
         s, theta, kappa = measurement.s, measurement.theta, measurement.kappa
-        for values, what in ((s, "arclength"), (theta, "bending angle"), (kappa, "curvature")):
-            require_finite(values, what, "strain")
+        for values, what in ((s, 'arclength'), (theta, 'bending angle'), (kappa, 'curvature')):
+            require_finite(values, what, 'strain')
         if len(s) == 0 or not len(s) == len(theta) == len(kappa):
-            raise MeasurementError("wrong size", f"strain needs as many s, theta, kappa, got {len(s)}, {len(theta)}, "
-                                                 f"{len(kappa)}")
+            raise MeasurementError(
+                'wrong size',
+                f'strain needs as many s, theta, kappa, got {len(s)}, {len(theta)}, {len(kappa)}',
+            )
         if np.min(s) < -1e-9 or np.max(s) > self.robot.length + 1e-9:
-            raise MeasurementError("off the body", f"strain stations from {np.min(s)} to {np.max(s)} m; the robot is "
-                                                   f"{self.robot.length} m long")
+            raise MeasurementError(
+                'off the body',
+                f'strain stations from {np.min(s)} to {np.max(s)} m; the robot is '
+                f'{self.robot.length} m long',
+            )
         bending = np.column_stack([-kappa * np.sin(theta), kappa * np.cos(theta)])
         return s, bending, self._information(bending, kappa)
 
@@ -44,29 +57,69 @@ class StrainFactor(Factor):
         tangential = np.maximum((scale * noise.theta_sigma * kappa) ** 2, radial)
         along = bending / np.maximum(np.abs(kappa), 1e-12)[:, None]
         outer = along[:, :, None] * along[:, None, :]
-        return np.eye(2) / tangential[:, None, None] + outer * (1.0 / radial - 1.0 / tangential)[:, None, None]
+        return (
+            np.eye(2) / tangential[:, None, None]
+            + outer * (1.0 / radial - 1.0 / tangential)[:, None, None]
+        )
 
     def stack(self, times, rows):
         """Rows of one interval grouped by station, as the geometry of a station serves all its samples."""
         s = np.concatenate([row[0] for row in rows])
         stations, station = rows[0][0], np.tile(np.arange(len(rows[0][0])), len(rows))
-        if len(s) != len(station) or not np.array_equal(s, stations[station]):  # not the same stations every time
+        if len(s) != len(station) or not np.array_equal(
+            s, stations[station]
+        ):  # not the same stations every time
             stations, station = np.unique(s, return_inverse=True)
-        return (np.repeat(times, [len(row[0]) for row in rows]), station.astype(np.int64),
-                np.concatenate([row[1] for row in rows]), np.concatenate([row[2] for row in rows]),
-                *self.grid.segments(stations))
+        return (
+            np.repeat(times, [len(row[0]) for row in rows]),
+            station.astype(np.int64),
+            np.concatenate([row[1] for row in rows]),
+            np.concatenate([row[2] for row in rows]),
+            *self.grid.segments(stations),
+        )
 
     def linearise(self, batch, a, b, blocks):
-        cost, squared = _add(blocks.H, blocks.g, a.T, a.strain, b.T, b.strain, b.time - a.time, self.grid.s, *batch,
-                             self.settings.strain.cauchy)
+        cost, squared = _add(
+            blocks.H,
+            blocks.g,
+            a.T,
+            a.strain,
+            b.T,
+            b.strain,
+            b.time - a.time,
+            self.grid.s,
+            *batch,
+            self.settings.strain.cauchy,
+        )
         return FactorReport(cost, squared, 2 * len(batch[0]))
 
 
 @njit(cache=True)
-def _add(H, g, T_a, eps_a, T_b, eps_b, dt, s, times, station, bending, information, segments, offsets, cauchy):
+def _add(
+    H,
+    g,
+    T_a,
+    eps_a,
+    T_b,
+    eps_b,
+    dt,
+    s,
+    times,
+    station,
+    bending,
+    information,
+    segments,
+    offsets,
+    cauchy,
+):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty((2, 6)), np.empty((6, 24)), np.empty((2, 6, 24))
+    T, rate, J_pose, J_rate = (
+        np.empty((4, 4)),
+        np.empty((2, 6)),
+        np.empty((6, 24)),
+        np.empty((2, 6, 24)),
+    )
     stations = segments.shape[0]
     local = np.zeros((stations, 4, 4))  # information of [bending at a; bending at b]
     slope = np.zeros((stations, 4))
@@ -74,10 +127,38 @@ def _add(H, g, T_a, eps_a, T_b, eps_b, dt, s, times, station, bending, informati
     jacobians = np.zeros((stations, 4, 48))
     for m in range(stations):
         n, ds = segments[m], s[segments[m] + 1] - s[segments[m]]
-        gp.hermite(T_a[n], eps_a[n], T_a[n + 1], eps_a[n + 1], ds, offsets[m], T, rate[0], J_pose, J_rate[0], W, V, M,
-                   J_work)
-        gp.hermite(T_b[n], eps_b[n], T_b[n + 1], eps_b[n + 1], ds, offsets[m], T, rate[1], J_pose, J_rate[1], W, V, M,
-                   J_work)
+        gp.hermite(
+            T_a[n],
+            eps_a[n],
+            T_a[n + 1],
+            eps_a[n + 1],
+            ds,
+            offsets[m],
+            T,
+            rate[0],
+            J_pose,
+            J_rate[0],
+            W,
+            V,
+            M,
+            J_work,
+        )
+        gp.hermite(
+            T_b[n],
+            eps_b[n],
+            T_b[n + 1],
+            eps_b[n + 1],
+            ds,
+            offsets[m],
+            T,
+            rate[1],
+            J_pose,
+            J_rate[1],
+            W,
+            V,
+            M,
+            J_work,
+        )
         for i in range(2):
             values[m, i] = rate[0, 4 + i]
             values[m, 2 + i] = rate[1, 4 + i]

@@ -1,21 +1,30 @@
-"""ToF: point-to-plane against the prior map (paper eqs. 1-4), associated anew whenever its interval is linearised.
+"""
+ToF: point-to-plane against the prior map (paper eqs. 1-4), associated anew whenever its interval
+is linearised.
 
-All zones of one frame share (s, t), so their residuals gather in one 6x6 information block in the body frame, which
-is chained once through the interpolation. With b = R^T n the row of a zone is [b, q x b] for a right perturbation.
-The noise acts along the beam: a hit at incidence n . d counts with variance sigma_d^2 (n . d)^2 plus the floor.
+All zones of one frame share (s, t), so their residuals gather in one 6x6 information block in the
+body frame, which is chained once through the interpolation. With b = R^T n the row of a zone is
+[b, q x b] for a right perturbation.
+The noise acts along the beam: a hit at incidence n . d counts with variance sigma_d^2 (n . d)^2
+plus the floor.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError, Repeats, known_sensor
+from continuum_loc.estimator.factors.base import (
+    Factor,
+    FactorReport,
+    known_sensor,
+    MeasurementError,
+    Repeats,
+)
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.mapping.voxel_index import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
+from numba import njit
+import numpy as np
 
 MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
 REACH = 1.0  # [m] range at which a turn of the body moves a zone, to decide when to associate anew
@@ -26,20 +35,29 @@ HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
 class TofFactor(Factor):
     """Zones of a ToF frame against the map's surface; `index` is the map's lookup, None switches the factor off."""
 
-    name = "tof"
+    name = 'tof'
     consumes = TofFrame
 
     def __init__(self, robot, grid, settings, prior_map=None, index=None):
         super().__init__(robot, grid, settings)
         self.gate, self.cauchy = settings.tof.gate, settings.tof.cauchy
         self.weights = dict.fromkeys((sensor.name for sensor in robot.tof), 1.0)
-        self._sensors = {sensor.name: (number, grid.node_at(robot.sensor_arclength(sensor.name)),
-                                       sensor.mount.T_ring_sensor) for number, sensor in enumerate(robot.tof)}
+        self._sensors = {
+            sensor.name: (
+                number,
+                grid.node_at(robot.sensor_arclength(sensor.name)),
+                sensor.mount.T_ring_sensor,
+            )
+            for number, sensor in enumerate(robot.tof)
+        }
         self._names = list(self._sensors)
         self._index = index
         self._repeats = Repeats(MOST_REPEATS)
         if prior_map is not None:
-            self._cloud, self._normals = np.ascontiguousarray(prior_map.points), np.ascontiguousarray(prior_map.normals)
+            self._cloud, self._normals = (
+                np.ascontiguousarray(prior_map.points),
+                np.ascontiguousarray(prior_map.normals),
+            )
             self._planarity = prior_map.planarity**settings.tof.planarity_power
             self._map_variance = prior_map.sigma**2
         model = robot.tof_model
@@ -53,26 +71,44 @@ class TofFactor(Factor):
         return self._index.arrays, self._cloud, self._normals, self._planarity, self._map_variance
 
     def row(self, measurement: TofFrame) -> tuple:
-        number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, "ToF")
+        number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, 'ToF')
         if self._index is None:
-            raise MeasurementError("no map", "ToF frames need a prior map")
+            raise MeasurementError('no map', 'ToF frames need a prior map')
         model = self.robot.tof_model
         points = np.asarray(measurement.points, float)
         if points.shape != (model.rows * model.columns, 3):
-            raise MeasurementError("wrong size", f"ToF frame of '{measurement.sensor}' has points {points.shape}; "
-                                                 f"the robot description says {model.rows} x {model.columns} zones")
+            raise MeasurementError(
+                'wrong size',
+                f"ToF frame of '{measurement.sensor}' has points {points.shape}; "
+                f'the robot description says {model.rows} x {model.columns} zones',
+            )
         q, rays = np.empty(points.shape), np.empty(points.shape)
         variance = np.empty(len(points))
-        usable = _beams(points, np.asarray(measurement.status), T_ring_sensor, model.min_range, model.max_range,
-                        self._noise_distance, self._noise_coefficient, q, rays, variance)
+        usable = _beams(
+            points,
+            np.asarray(measurement.status),
+            T_ring_sensor,
+            model.min_range,
+            model.max_range,
+            self._noise_distance,
+            self._noise_coefficient,
+            q,
+            rays,
+            variance,
+        )
         if usable > 0 and self._repeats.frozen(measurement.sensor, points):
-            raise MeasurementError("frozen", f"ToF sensor '{measurement.sensor}' repeats itself to the last bit")
+            raise MeasurementError(
+                'frozen', f"ToF sensor '{measurement.sensor}' repeats itself to the last bit"
+            )
         return number, node, q, rays, variance, Association(len(points))
 
     def stack(self, times, rows):
         """The association of each row becomes a view into the stacked arrays, so that it outlives the next stacking."""
         kept = [row[5] for row in rows]
-        hits, poses = np.array([one.hits for one in kept]), np.array([one.T_map_body for one in kept])
+        hits, poses = (
+            np.array([one.hits for one in kept]),
+            np.array([one.T_map_body for one in kept]),
+        )
         for one, hit, T in zip(kept, hits, poses, strict=True):
             one.hits, one.T_map_body = hit, T
         return (times, *(np.array([row[i] for row in rows]) for i in range(5)), hits, poses)
@@ -83,9 +119,30 @@ class TofFactor(Factor):
         weights = np.array([self.weights[self._names[s]] for s in sensors])
         fits = np.zeros((len(times), 2))
         cost, squared, count = _add(
-            blocks.H, blocks.g, a.T, a.velocity, b.T, b.velocity, b.time - a.time, times, nodes, q, rays, variance,
-            weights, *self.map_arrays, options.floor**2, options.footprint * self._half_zone, self.cauchy, self.gate,
-            options.min_cosine, options.reassociate, hits, poses, fits)
+            blocks.H,
+            blocks.g,
+            a.T,
+            a.velocity,
+            b.T,
+            b.velocity,
+            b.time - a.time,
+            times,
+            nodes,
+            q,
+            rays,
+            variance,
+            weights,
+            *self.map_arrays,
+            options.floor**2,
+            options.footprint * self._half_zone,
+            self.cauchy,
+            self.gate,
+            options.min_cosine,
+            options.reassociate,
+            hits,
+            poses,
+            fits,
+        )
         by_sensor = np.zeros((len(self._names), 2))
         np.add.at(by_sensor, sensors, fits)
         heard = np.flatnonzero(np.bincount(sensors, minlength=len(self._names)))
@@ -93,10 +150,12 @@ class TofFactor(Factor):
 
 
 class Association:
-    """Map points that a frame's zones were matched to, and the pose at which; its last element holds the gate, so that
-    another gate associates anew."""
+    """
+    Map points that a frame's zones were matched to, and the pose at which; its last element holds
+    the gate, so that another gate associates anew.
+    """
 
-    __slots__ = ("T_map_body", "hits")
+    __slots__ = ('T_map_body', 'hits')
 
     def __init__(self, zones: int):
         self.hits = np.full(zones, -1, np.int64)
@@ -104,7 +163,18 @@ class Association:
 
 
 @njit(cache=True)
-def _beams(points, status, T_ring_sensor, min_range, max_range, noise_distance, noise_coefficient, q, rays, variance):
+def _beams(
+    points,
+    status,
+    T_ring_sensor,
+    min_range,
+    max_range,
+    noise_distance,
+    noise_coefficient,
+    q,
+    rays,
+    variance,
+):
     """Zones in the ring's frame: q, rays (Z, 3), variance (Z,) infinite where unusable; the number of usable ones."""
     usable = 0
     for z in range(points.shape[0]):
@@ -137,8 +207,35 @@ def _moved(T, before, reach):
 
 
 @njit(cache=True)
-def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights, arrays, cloud, normals, planarity,
-         map_variance, floor2, footprint, cauchy, gate, min_cosine, reassociate, hits, poses, fits):
+def _add(
+    H,
+    g,
+    T_a,
+    v_a,
+    T_b,
+    v_b,
+    dt,
+    times,
+    nodes,
+    q,
+    rays,
+    variance,
+    weights,
+    arrays,
+    cloud,
+    normals,
+    planarity,
+    map_variance,
+    floor2,
+    footprint,
+    cauchy,
+    gate,
+    min_cosine,
+    reassociate,
+    hits,
+    poses,
+    fits,
+):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
@@ -148,14 +245,32 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights,
     cost, squared, count = 0.0, 0.0, 0
     for f in range(times.shape[0]):
         n = nodes[f]
-        gp.hermite(T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
+        gp.hermite(
+            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work
+        )
         if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
             associate(T, q[f], rays[f], variance[f], arrays, normals, gate, min_cosine, hits[f])
             poses[f] = T
             poses[f, 3, 3] = gate
         frame_cost, frame_squared, frame_count = frame_information(
-            T, q[f], rays[f], variance[f], hits[f], weights[f], cloud, normals, planarity, map_variance, floor2,
-            footprint, cauchy, gate, H_body, g_body, fits[f])
+            T,
+            q[f],
+            rays[f],
+            variance[f],
+            hits[f],
+            weights[f],
+            cloud,
+            normals,
+            planarity,
+            map_variance,
+            floor2,
+            footprint,
+            cauchy,
+            gate,
+            H_body,
+            g_body,
+            fits[f],
+        )
         gp.time_index(n, VELOCITY, size, index)
         gp.add_local(H, g, index, H_body, g_body, J_pose, work)
         cost += frame_cost
@@ -166,24 +281,47 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, q, rays, variance, weights,
 
 @njit(cache=True)
 def associate(T, q, rays, variance, arrays, normals, gate, min_cosine, hits):
-    """hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body; -1 where there is none."""
+    """Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body; -1 where there is none."""
     zones = q.shape[0]
     points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
     for z in range(zones):
         nowhere = not np.isfinite(variance[z])  # a query of nan matches nothing
         for i in range(3):
-            points[z, i] = np.nan if nowhere else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
+            points[z, i] = (
+                np.nan
+                if nowhere
+                else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
+            )
             directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
     nearest_facing_batch(arrays, normals, points, directions, gate, min_cosine, hits, distance2)
 
 
 @njit(cache=True)
-def frame_information(T, q, rays, variance, hits, weight, cloud, normals, planarity, map_variance, floor2, footprint,
-                      cauchy, gate, H, g, fit):
-    """Normal equations H (6, 6), g (6,) of one frame at T_map_body, and [usable, fitting] zones in `fit`.
+def frame_information(
+    T,
+    q,
+    rays,
+    variance,
+    hits,
+    weight,
+    cloud,
+    normals,
+    planarity,
+    map_variance,
+    floor2,
+    footprint,
+    cauchy,
+    gate,
+    H,
+    g,
+    fit,
+):
+    """
+    Normal equations H (6, 6), g (6,) of one frame at T_map_body, and [usable, fitting] zones in
+    `fit`.
 
-    Returns the robust cost, the sum of weighted squared residuals and the number of matched zones. An unmatched
-    zone costs what a residual at the gate would, so that losing matches never pays.
+    Returns the robust cost, the sum of weighted squared residuals and the number of matched zones.
+    An unmatched zone costs what a residual at the gate would, so that losing matches never pays.
     """
     H[:, :] = 0.0
     g[:] = 0.0
@@ -234,4 +372,3 @@ def frame_information(T, q, rays, variance, hits, weight, cloud, normals, planar
         for j in range(i):
             H[j, i] = H[i, j]
     return cost, squared, count
-

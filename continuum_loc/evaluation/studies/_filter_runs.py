@@ -2,68 +2,74 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
-import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+import hashlib
+import json
 from pathlib import Path
+import re
+import traceback
 from typing import Any
-
-import numpy as np
 
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
 from continuum_loc.evaluation.campaign import bag_of, parallel, record_bags, show_progress
 from continuum_loc.evaluation.metrics import Errors, errors
 from continuum_loc.evaluation.replay import Filter, replay, samples_of
-from continuum_loc.evaluation.runs import Run, load_run, save_run
+from continuum_loc.evaluation.runs import load_run, Run, save_run
 from continuum_loc.evaluation.study import Claim, plain, write_json
 from continuum_loc.evaluation.tables import markdown
 from continuum_loc.evaluation.tracks import associate
-from continuum_loc.evaluation.trials import Trial, configuration, make_filter, scene_map
-from continuum_loc.measurements import NANOSECONDS, Measurement, TruthSample, nanoseconds
+from continuum_loc.evaluation.trials import configuration, make_filter, scene_map, Trial
+from continuum_loc.measurements import Measurement, NANOSECONDS, nanoseconds, TruthSample
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.faults import Fault
+import numpy as np
 
 OFF = 0.05  # m: a ring farther from the truth is off
 
 
 @dataclass(frozen=True)
 class Case:
-    """One replay of a trial's recording.
+    """
+    One replay of a trial's recording.
 
-    name: of the variant, not of the trial. changes: the filter's settings that differ, by section as in YAML.
-    start, end: what part of the recording the filter gets [s]. faults: wrappers, their times counted from `start`.
+    name: of the variant, not of the trial. changes: the filter's settings that differ, by section
+    as in YAML.
+    start, end: what part of the recording the filter gets [s]. faults: wrappers, their times
+    counted from `start`.
     """
 
     name: str
     trial: Trial
     changes: dict[str, Any] = field(default_factory=dict)
     start: float = 0.0
-    end: float = float("inf")
+    end: float = float('inf')
     faults: tuple[Fault, ...] = ()
 
     @property
     def folder(self) -> str:
         """Where its run lies, unique among the cases of a study."""
-        cut = f"-{self.start:g}s" if self.start else ""
-        return re.sub(r"[^\w.-]+", "_", f"{self.name}-{self.trial.name}{cut}")
+        cut = f'-{self.start:g}s' if self.start else ''
+        return re.sub(r'[^\w.-]+', '_', f'{self.name}-{self.trial.name}{cut}')
 
 
 @dataclass(frozen=True, eq=False)
 class CaseResult:
-    """What became of a case. Without a run, `error` says why; the arrays are over the steps where truth is known.
+    """
+    What became of a case. Without a run, `error` says why; the arrays are over the steps where
+    truth is known.
 
-    times: (K,) s since the filter's first sample. status: (K,). found: errors. For every step of `steps` (S,) s,
-    accused: names of the sensors that the filter suspects; shares: of samples that fit, by sensor that it has heard.
+    times: (K,) s since the filter's first sample. status: (K,). found: errors. For every step of
+    `steps` (S,) s,
+    accused: names of the sensors that the filter suspects; shares: of samples that fit, by sensor
+    that it has heard.
     """
 
     case: Case
     run: Run | None
-    error: str = ""
+    error: str = ''
     times: np.ndarray = field(default_factory=lambda: np.empty(0))
     status: np.ndarray = field(default_factory=lambda: np.empty(0, str))
     found: Errors | None = None
@@ -99,8 +105,13 @@ class Witness:
 
     def _note(self, estimate: Estimate | None) -> Estimate | None:
         if estimate is not None:
-            self.log.append({"stamp": estimate.stamp, "accused": list(estimate.suspects),
-                             "shares": dict(estimate.inliers)})
+            self.log.append(
+                {
+                    'stamp': estimate.stamp,
+                    'accused': list(estimate.suspects),
+                    'shares': dict(estimate.inliers),
+                }
+            )
         return estimate
 
 
@@ -108,21 +119,25 @@ def run_cases(cases: Sequence[Case], out: Path, jobs: int) -> list[CaseResult]:
     """Simulate the recordings and replay the cases that `out` does not hold yet; results in the order of `cases`."""
     failed = record_bags([case.trial for case in cases], out, jobs)
     todo = [(out, case) for case in cases if case.trial.recording not in failed]
-    problems = dict(show_progress(parallel(replay_case, todo, jobs), len(todo), "estimating"))
-    return [CaseResult(case, None, failed[case.trial.recording]) if case.trial.recording in failed
-            else load_case(out, case, problems[case.folder]) for case in cases]
+    problems = dict(show_progress(parallel(replay_case, todo, jobs), len(todo), 'estimating'))
+    return [
+        CaseResult(case, None, failed[case.trial.recording])
+        if case.trial.recording in failed
+        else load_case(out, case, problems[case.folder])
+        for case in cases
+    ]
 
 
 def replay_case(out: Path, case: Case) -> tuple[str, str]:
     """Replay a case into its run folder unless it is there. Returns (its folder's name, what went wrong or "")."""
-    folder = out / "cases" / case.folder
+    folder = out / 'cases' / case.folder
     try:
         _replay(out, case, folder)
     except Exception as error:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "error.txt").write_text(traceback.format_exc())
-        return case.folder, f"{type(error).__name__}: {error}"
-    return case.folder, ""
+        (folder / 'error.txt').write_text(traceback.format_exc())
+        return case.folder, f'{type(error).__name__}: {error}'
+    return case.folder, ''
 
 
 def _replay(out: Path, case: Case, folder: Path) -> None:
@@ -131,16 +146,29 @@ def _replay(out: Path, case: Case, folder: Path) -> None:
     key = hashlib.sha256(json.dumps(plain(resolved), sort_keys=True).encode()).hexdigest()
     if _digest(folder) == key:
         return
-    witness = Witness(make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene), settings))
+    witness = Witness(
+        make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene), settings)
+    )
     result = replay(case_samples(samples_of(bag_of(out, trial)), case), witness)
-    (folder / "error.txt").unlink(missing_ok=True)
-    save_run(folder, result, kind="case", seed=trial.seed, configuration=resolved, extra={"case_digest": key})
-    write_json(folder / "diagnostics.json", witness.log)
+    (folder / 'error.txt').unlink(missing_ok=True)
+    save_run(
+        folder,
+        result,
+        kind='case',
+        seed=trial.seed,
+        configuration=resolved,
+        extra={'case_digest': key},
+    )
+    write_json(folder / 'diagnostics.json', witness.log)
 
 
 def _digest(folder: Path) -> str | None:
-    files = [folder / "summary.json", folder / "diagnostics.json"]
-    return json.loads(files[0].read_text())["case_digest"] if all(file.is_file() for file in files) else None
+    files = [folder / 'summary.json', folder / 'diagnostics.json']
+    return (
+        json.loads(files[0].read_text())['case_digest']
+        if all(file.is_file() for file in files)
+        else None
+    )
 
 
 def case_settings(case: Case) -> EstimatorSettings:
@@ -151,7 +179,9 @@ def case_settings(case: Case) -> EstimatorSettings:
     return parse_settings(EstimatorSettings, data, where=case.name)
 
 
-def case_samples(samples: Iterable[Measurement | TruthSample], case: Case) -> Iterator[Measurement | TruthSample]:
+def case_samples(
+    samples: Iterable[Measurement | TruthSample], case: Case
+) -> Iterator[Measurement | TruthSample]:
     """The part of a recording that the case wants, with its faults."""
     stream = cut(samples, case.start, case.end)
     for fault in case.faults:
@@ -159,7 +189,9 @@ def case_samples(samples: Iterable[Measurement | TruthSample], case: Case) -> It
     return stream
 
 
-def cut(samples: Iterable[Measurement | TruthSample], start: float, end: float) -> Iterator[Measurement | TruthSample]:
+def cut(
+    samples: Iterable[Measurement | TruthSample], start: float, end: float
+) -> Iterator[Measurement | TruthSample]:
     """The samples whose stamps lie in [start, end) seconds after the first one's."""
     epoch = None
     for sample in samples:
@@ -170,32 +202,42 @@ def cut(samples: Iterable[Measurement | TruthSample], start: float, end: float) 
             yield sample
 
 
-def load_case(out: Path, case: Case, error: str = "") -> CaseResult:
+def load_case(out: Path, case: Case, error: str = '') -> CaseResult:
     """Read a case's run folder back and compare it with the truth."""
     if error:
         return CaseResult(case, None, error)
-    folder = out / "cases" / case.folder
+    folder = out / 'cases' / case.folder
     run = load_run(folder)
     track, truth = run.result.track, run.result.truth
     if len(track) == 0:
-        return CaseResult(case, None, "the filter gave no estimate")
+        return CaseResult(case, None, 'the filter gave no estimate')
     found = errors(track, truth)
     epoch = truth.stamps[0]
-    log = json.loads((folder / "diagnostics.json").read_text())
-    return CaseResult(case, run, "", (found.stamps - epoch) / NANOSECONDS, associate(track, truth)[0].status, found,
-                      np.array([(entry["stamp"] - epoch) / NANOSECONDS for entry in log]),
-                      [entry["accused"] for entry in log], [entry["shares"] for entry in log])
+    log = json.loads((folder / 'diagnostics.json').read_text())
+    return CaseResult(
+        case,
+        run,
+        '',
+        (found.stamps - epoch) / NANOSECONDS,
+        associate(track, truth)[0].status,
+        found,
+        np.array([(entry['stamp'] - epoch) / NANOSECONDS for entry in log]),
+        [entry['accused'] for entry in log],
+        [entry['shares'] for entry in log],
+    )
 
 
 def longest_unannounced(result: CaseResult) -> float:
     """The longest time [s] for which some ring is off although the filter says that it is tracking."""
-    off = (result.found.translation_m[:, 1:] > OFF) & (result.status == "tracking")[:, None]
+    off = (result.found.translation_m[:, 1:] > OFF) & (result.status == 'tracking')[:, None]
     return max(longest_stretch(result.times, off[:, ring]) for ring in range(off.shape[1]))
 
 
 def longest_stretch(times: np.ndarray, flags: np.ndarray) -> float:
-    """The longest time [s] over which `flags` (K,) stay true at consecutive `times` (K,); each counts until the next,
-    the last one for the usual distance between them."""
+    """
+    The longest time [s] over which `flags` (K,) stay true at consecutive `times` (K,); each counts
+    until the next, the last one for the usual distance between them.
+    """
     if not np.any(flags):
         return 0.0
     usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
@@ -209,7 +251,7 @@ def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
     wrong = np.flatnonzero(~flags)
     if len(wrong) == 0:
         return float(times[0])
-    return float(times[wrong[-1] + 1]) if wrong[-1] + 1 < len(times) else float("inf")
+    return float(times[wrong[-1] + 1]) if wrong[-1] + 1 < len(times) else float('inf')
 
 
 def failures(results: Sequence[CaseResult]) -> dict[str, str]:
@@ -217,18 +259,30 @@ def failures(results: Sequence[CaseResult]) -> dict[str, str]:
     return {result.case.folder: result.error for result in results if result.run is None}
 
 
-def write_page(out: Path, title: str, text: str, claims: Sequence[Claim],
-               tables: dict[str, Sequence[dict[str, Any]]]) -> Path:
+def write_page(
+    out: Path,
+    title: str,
+    text: str,
+    claims: Sequence[Claim],
+    tables: dict[str, Sequence[dict[str, Any]]],
+) -> Path:
     """Write `out/study.md`: the explanation, the claims (those that fail first) and the tables."""
     import pandas as pd
 
-    rows = [{"claim": claim.name, "value": f"{claim.value:.4g} {claim.unit}".strip(), "bound": claim.bound,
-             "holds": claim.holds} for claim in sorted(claims, key=lambda claim: claim.holds)]
-    parts = [f"# {title}", text, "## Claims", markdown(pd.DataFrame(rows))]
+    rows = [
+        {
+            'claim': claim.name,
+            'value': f'{claim.value:.4g} {claim.unit}'.strip(),
+            'bound': claim.bound,
+            'holds': claim.holds,
+        }
+        for claim in sorted(claims, key=lambda claim: claim.holds)
+    ]
+    parts = [f'# {title}', text, '## Claims', markdown(pd.DataFrame(rows))]
     for name, table in tables.items():
         if not table:
             continue
-        parts += [f"## {name}", markdown(pd.DataFrame(list(table)))]
-    path = out / "study.md"
-    path.write_text("\n\n".join(part.rstrip() for part in parts) + "\n")
+        parts += [f'## {name}', markdown(pd.DataFrame(list(table)))]
+    path = out / 'study.md'
+    path.write_text('\n\n'.join(part.rstrip() for part in parts) + '\n')
     return path

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from continuum_loc.evaluation.split import HOLD_OUT, require_unseen
 from continuum_loc.evaluation.studies._filter_runs import (
     Case,
@@ -18,34 +16,44 @@ from continuum_loc.evaluation.studies._filter_runs import (
     settled_since,
     write_page,
 )
-from continuum_loc.evaluation.study import Claim, at_least, at_most, write_study
+from continuum_loc.evaluation.study import at_least, at_most, Claim, write_study
 from continuum_loc.evaluation.trials import Trial
+import numpy as np
 
-NO_STRAIN = {"strain": {"enabled": False}}
-NO_GYRO = {"gyro": {"enabled": False}}
-NO_TOF = {"tof": {"enabled": False}}
-NO_RECOVERY = {"recovery": {"enabled": False}}
+NO_STRAIN = {'strain': {'enabled': False}}
+NO_GYRO = {'gyro': {'enabled': False}}
+NO_TOF = {'tof': {'enabled': False}}
+NO_RECOVERY = {'recovery': {'enabled': False}}
 NEVER = 1e6  # sigmas: a Cauchy loss of this scale is least squares
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "all sensors": {},
-    "without strain": NO_STRAIN,
-    "without strain, no recovery": NO_STRAIN | NO_RECOVERY,
-    "without ToF": NO_TOF,
-    "without gyro": NO_GYRO,
-    "strain alone": NO_TOF | NO_GYRO,
-    "ToF alone": NO_STRAIN | NO_GYRO,
-    "ToF alone, no recovery": NO_STRAIN | NO_GYRO | NO_RECOVERY,
-    "without planarity weight": {"tof": {"planarity_power": 0.0}},
-    "without robust loss": {"tof": {"cauchy": NEVER}, "gyro": {"cauchy": NEVER}, "strain": {"cauchy": NEVER}},
-    "gyro without robust loss": {"gyro": {"cauchy": NEVER}},
-    "window 0.5 s": {"window": 0.5},
-    "window 1 s": {"window": 1.0},
-    "window 2 s": {"window": 2.0},
+    'all sensors': {},
+    'without strain': NO_STRAIN,
+    'without strain, no recovery': NO_STRAIN | NO_RECOVERY,
+    'without ToF': NO_TOF,
+    'without gyro': NO_GYRO,
+    'strain alone': NO_TOF | NO_GYRO,
+    'ToF alone': NO_STRAIN | NO_GYRO,
+    'ToF alone, no recovery': NO_STRAIN | NO_GYRO | NO_RECOVERY,
+    'without planarity weight': {'tof': {'planarity_power': 0.0}},
+    'without robust loss': {
+        'tof': {'cauchy': NEVER},
+        'gyro': {'cauchy': NEVER},
+        'strain': {'cauchy': NEVER},
+    },
+    'gyro without robust loss': {'gyro': {'cauchy': NEVER}},
+    'window 0.5 s': {'window': 0.5},
+    'window 1 s': {'window': 1.0},
+    'window 2 s': {'window': 2.0},
 }
-AGAINST_THE_MAP = ("all sensors", "without strain", "without planarity weight", "without robust loss")
-QUICK = ("all sensors", "without strain", "without ToF")
-COLD = {"cold": NO_STRAIN, "cold, no recovery": NO_STRAIN | NO_RECOVERY}
+AGAINST_THE_MAP = (
+    'all sensors',
+    'without strain',
+    'without planarity weight',
+    'without robust loss',
+)
+QUICK = ('all sensors', 'without strain', 'without ToF')
+COLD = {'cold': NO_STRAIN, 'cold, no recovery': NO_STRAIN | NO_RECOVERY}
 COLD_STARTS = (5.0, 9.0, 12.0, 15.0)  # s into a trial, when the robot is bent
 COLD_LENGTH = 3.0  # s
 FOUND = 0.02  # m: with every ring closer than this a cold start has found itself
@@ -66,43 +74,72 @@ A ring counts as off beyond 5 cm, and *unannounced* is the longest time for whic
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Replay every variant over trials that no number was tuned on (`quick`: three over four seconds, one cold start).
-    """
+    """Replay every variant over trials that no number was tuned on (`quick`: three over four seconds, one cold start)."""
     cases = warm_cases(quick, seed) + cold_cases(quick, seed)
     require_unseen([case.trial for case in cases])
     results = run_cases(cases, out, jobs)
     warm = [result for result in results if result.case.name in VARIANTS]
     cold = [result for result in results if result.case.name in COLD]
     claims = judge(warm, cold)
-    tables = {"ablation": variant_rows([result for result in warm if as_mapped(result)]),
-              "ablation_changed_scene": variant_rows([result for result in warm if not as_mapped(result)]),
-              "ablation_trials": [trial_row(result) for result in warm if result.run],
-              "cold_starts": [cold_row(result) for result in cold if result.run]}
-    write_study(out, claims, seed=seed, settings={"cases": cases}, tables=tables,
-                extra={"quick": quick, "hold_out": HOLD_OUT["engine"], "failed": failures(results)})
-    write_page(out, "Ablation: the engine robot", TEXT.format(drift=drift(warm), minima=minima(cold)), claims,
-               {"By variant": tables["ablation"], "By variant, in a scene that differs from its map":
-                tables["ablation_changed_scene"], "Cold starts": tables["cold_starts"]})
+    tables = {
+        'ablation': variant_rows([result for result in warm if as_mapped(result)]),
+        'ablation_changed_scene': variant_rows(
+            [result for result in warm if not as_mapped(result)]
+        ),
+        'ablation_trials': [trial_row(result) for result in warm if result.run],
+        'cold_starts': [cold_row(result) for result in cold if result.run],
+    }
+    write_study(
+        out,
+        claims,
+        seed=seed,
+        settings={'cases': cases},
+        tables=tables,
+        extra={'quick': quick, 'hold_out': HOLD_OUT['engine'], 'failed': failures(results)},
+    )
+    write_page(
+        out,
+        'Ablation: the engine robot',
+        TEXT.format(drift=drift(warm), minima=minima(cold)),
+        claims,
+        {
+            'By variant': tables['ablation'],
+            'By variant, in a scene that differs from its map': tables['ablation_changed_scene'],
+            'Cold starts': tables['cold_starts'],
+        },
+    )
     return claims
 
 
 def warm_cases(quick: bool, seed: int) -> list[Case]:
     """Every variant from the start of two trials, and those that bear on it in a scene that differs from its map."""
     if quick:
-        return [Case(name, Trial(trajectory="t2", seed=seed, duration=6.0), VARIANTS[name], end=4.0) for name in QUICK]
-    changed = Trial(scene="S9", trajectory="t2", map_scene="S0", seed=seed)
-    trials = [Trial(trajectory="t2", seed=seed), Trial(trajectory="t3", seed=seed)]
-    return [Case(name, trial, changes) for name, changes in VARIANTS.items()
-            for trial in [*trials, *[changed] * (name in AGAINST_THE_MAP)]]
+        return [
+            Case(name, Trial(trajectory='t2', seed=seed, duration=6.0), VARIANTS[name], end=4.0)
+            for name in QUICK
+        ]
+    changed = Trial(scene='S9', trajectory='t2', map_scene='S0', seed=seed)
+    trials = [Trial(trajectory='t2', seed=seed), Trial(trajectory='t3', seed=seed)]
+    return [
+        Case(name, trial, changes)
+        for name, changes in VARIANTS.items()
+        for trial in [*trials, *[changed] * (name in AGAINST_THE_MAP)]
+    ]
 
 
 def cold_cases(quick: bool, seed: int) -> list[Case]:
     """Starts in the middle of a recording, where the robot is bent and moves: the base is all that is known."""
     if quick:
-        return [Case("cold", Trial(trajectory="t2", seed=seed, duration=6.0), COLD["cold"], start=4.6)]
-    trials = [Trial(trajectory=name, seed=seed) for name in ("t2", "t3")]
-    return [Case(name, trial, changes, start, start + COLD_LENGTH)
-            for name, changes in COLD.items() for trial in trials for start in COLD_STARTS]
+        return [
+            Case('cold', Trial(trajectory='t2', seed=seed, duration=6.0), COLD['cold'], start=4.6)
+        ]
+    trials = [Trial(trajectory=name, seed=seed) for name in ('t2', 't3')]
+    return [
+        Case(name, trial, changes, start, start + COLD_LENGTH)
+        for name, changes in COLD.items()
+        for trial in trials
+        for start in COLD_STARTS
+    ]
 
 
 def by_name(results: Sequence[CaseResult]) -> dict[str, list[CaseResult]]:
@@ -122,26 +159,51 @@ def as_mapped(result: CaseResult) -> bool:
 def judge(warm: Sequence[CaseResult], cold: Sequence[CaseResult]) -> list[Claim]:
     """The bound for trials without strain, and the paper's two claims as figures."""
     groups = by_name(warm) | by_name(cold)
-    claims = [at_most(f"{name}: longest time a ring is off unannounced",
-                      max(longest_unannounced(result) for result in groups[name]), "s", UNANNOUNCED)
-              for name in ("without strain", "ToF alone", "cold") if name in groups]
-    if "cold" in groups:
-        claims.append(at_least("cold starts that have found themselves at the end",
-                               sum(found_after(result) < np.inf for result in groups["cold"]), "",
-                               len(groups["cold"])))
-    if "without ToF" in groups and "all sensors" in groups:
+    claims = [
+        at_most(
+            f'{name}: longest time a ring is off unannounced',
+            max(longest_unannounced(result) for result in groups[name]),
+            's',
+            UNANNOUNCED,
+        )
+        for name in ('without strain', 'ToF alone', 'cold')
+        if name in groups
+    ]
+    if 'cold' in groups:
+        claims.append(
+            at_least(
+                'cold starts that have found themselves at the end',
+                sum(found_after(result) < np.inf for result in groups['cold']),
+                '',
+                len(groups['cold']),
+            )
+        )
+    if 'without ToF' in groups and 'all sensors' in groups:
         claims += drift_claims(groups)
     broken = sum(result.run is None for result in (*warm, *cold))
-    return [*claims, at_most("cases that failed", broken, "", 0)]
+    return [*claims, at_most('cases that failed', broken, '', 0)]
 
 
 def drift_claims(groups: dict[str, list[CaseResult]]) -> list[Claim]:
     """Without ToF the error grows along the body; with it the tip is several times better."""
-    without, everything = (ring_errors([result for result in groups[name] if as_mapped(result)])
-                           for name in ("without ToF", "all sensors"))
-    return [at_least("without ToF: tip MAE over the first ring's (drift along the body)", without[-1] / without[0],
-                     "ratio", 2.0),
-            at_least("without ToF: tip MAE over that with all sensors", without[-1] / everything[-1], "ratio", 1.5)]
+    without, everything = (
+        ring_errors([result for result in groups[name] if as_mapped(result)])
+        for name in ('without ToF', 'all sensors')
+    )
+    return [
+        at_least(
+            "without ToF: tip MAE over the first ring's (drift along the body)",
+            without[-1] / without[0],
+            'ratio',
+            2.0,
+        ),
+        at_least(
+            'without ToF: tip MAE over that with all sensors',
+            without[-1] / everything[-1],
+            'ratio',
+            1.5,
+        ),
+    ]
 
 
 def ring_errors(results: Sequence[CaseResult]) -> np.ndarray:
@@ -163,47 +225,70 @@ def variant_row(name: str, results: Sequence[CaseResult]) -> dict[str, Any]:
     """One variant over its trials."""
     rings = 100.0 * ring_errors(results)
     status = np.concatenate([result.status for result in results])
-    row = {"variant": name, **{f"ring {k} [cm]": value for k, value in enumerate(rings.tolist(), start=1)}}
-    row["rotation [deg]"] = float(np.mean([result.found.rotation_deg[:, 1:].mean() for result in results]))
-    row["worst [cm]"] = 100.0 * max(float(result.worst_ring.max()) for result in results)
-    row["unannounced [s]"] = max(longest_unannounced(result) for result in results)
-    row["said lost [%]"] = 100.0 * float(np.mean(status == "lost"))
-    row["NEES/dof"] = float(np.mean([result.run.summary["nees_per_dof"] for result in results]))
-    row["step [ms]"] = float(np.mean([result.run.summary["step_ms"]["mean"] for result in results]))
+    row = {
+        'variant': name,
+        **{f'ring {k} [cm]': value for k, value in enumerate(rings.tolist(), start=1)},
+    }
+    row['rotation [deg]'] = float(
+        np.mean([result.found.rotation_deg[:, 1:].mean() for result in results])
+    )
+    row['worst [cm]'] = 100.0 * max(float(result.worst_ring.max()) for result in results)
+    row['unannounced [s]'] = max(longest_unannounced(result) for result in results)
+    row['said lost [%]'] = 100.0 * float(np.mean(status == 'lost'))
+    row['NEES/dof'] = float(np.mean([result.run.summary['nees_per_dof'] for result in results]))
+    row['step [ms]'] = float(
+        np.mean([result.run.summary['step_ms']['mean'] for result in results])
+    )
     return row
 
 
 def trial_row(result: CaseResult) -> dict[str, Any]:
     """One trial of a variant."""
     trial = result.case.trial
-    return {"variant": result.case.name, "scene": trial.scene, "trajectory": trial.trajectory,
-            "translation MAE [cm]": 100.0 * float(result.found.translation_m[:, 1:].mean()),
-            "tip MAE [cm]": 100.0 * float(result.found.translation_m[:, -1].mean()),
-            "worst [cm]": 100.0 * float(result.worst_ring.max()),
-            "unannounced [s]": longest_unannounced(result), "NEES/dof": result.run.summary["nees_per_dof"],
-            "coverage": result.run.summary["coverage_95"]}
+    return {
+        'variant': result.case.name,
+        'scene': trial.scene,
+        'trajectory': trial.trajectory,
+        'translation MAE [cm]': 100.0 * float(result.found.translation_m[:, 1:].mean()),
+        'tip MAE [cm]': 100.0 * float(result.found.translation_m[:, -1].mean()),
+        'worst [cm]': 100.0 * float(result.worst_ring.max()),
+        'unannounced [s]': longest_unannounced(result),
+        'NEES/dof': result.run.summary['nees_per_dof'],
+        'coverage': result.run.summary['coverage_95'],
+    }
 
 
 def cold_row(result: CaseResult) -> dict[str, Any]:
     """One cold start."""
     count = len(result.times)
-    return {"start": result.case.name, "trajectory": result.case.trial.trajectory, "at [s]": result.case.start,
-            "first error [cm]": 100.0 * float(result.worst_ring[0]),
-            "found after [s]": found_after(result), "last error [cm]": 100.0 * float(result.worst_ring[-1]),
-            "unannounced [s]": longest_unannounced(result),
-            **{f"{name} [%]": 100.0 * float(np.sum(result.status == name)) / count
-               for name in ("initialising", "tracking", "lost")}}
+    return {
+        'start': result.case.name,
+        'trajectory': result.case.trial.trajectory,
+        'at [s]': result.case.start,
+        'first error [cm]': 100.0 * float(result.worst_ring[0]),
+        'found after [s]': found_after(result),
+        'last error [cm]': 100.0 * float(result.worst_ring[-1]),
+        'unannounced [s]': longest_unannounced(result),
+        **{
+            f'{name} [%]': 100.0 * float(np.sum(result.status == name)) / count
+            for name in ('initialising', 'tracking', 'lost')
+        },
+    }
 
 
 def drift(warm: Sequence[CaseResult]) -> str:
     """The paper's first claim in figures."""
     groups = by_name(warm)
-    if "without ToF" not in groups or "all sensors" not in groups:
-        return "no figures, as the trials failed"
-    without, everything = (100.0 * ring_errors([result for result in groups[name] if as_mapped(result)])
-                           for name in ("without ToF", "all sensors"))
-    return (f"without ToF it goes from {without[0]:.2f} cm at the first ring to {without[-1]:.2f} cm at the tip, with "
-            f"all sensors from {everything[0]:.2f} cm to {everything[-1]:.2f} cm")
+    if 'without ToF' not in groups or 'all sensors' not in groups:
+        return 'no figures, as the trials failed'
+    without, everything = (
+        100.0 * ring_errors([result for result in groups[name] if as_mapped(result)])
+        for name in ('without ToF', 'all sensors')
+    )
+    return (
+        f'without ToF it goes from {without[0]:.2f} cm at the first ring to {without[-1]:.2f} cm at the tip, with '
+        f'all sensors from {everything[0]:.2f} cm to {everything[-1]:.2f} cm'
+    )
 
 
 def minima(cold: Sequence[CaseResult]) -> str:
@@ -212,6 +297,8 @@ def minima(cold: Sequence[CaseResult]) -> str:
     for name, members in by_name(cold).items():
         stuck = sum(found_after(result) == np.inf for result in members)
         worst = 100.0 * max(float(result.worst_ring[-1]) for result in members)
-        told.append(f"`{name}` ends in a wrong body in {stuck} of {len(members)} starts (the worst by {worst:.1f} cm), "
-                    f"off unannounced for up to {max(longest_unannounced(result) for result in members):.2f} s")
-    return "; ".join(told) or "no figures, as the trials failed"
+        told.append(
+            f'`{name}` ends in a wrong body in {stuck} of {len(members)} starts (the worst by {worst:.1f} cm), '
+            f'off unannounced for up to {max(longest_unannounced(result) for result in members):.2f} s'
+        )
+    return '; '.join(told) or 'no figures, as the trials failed'

@@ -9,12 +9,16 @@ from continuum_loc.evaluation.campaign import Outcome, run_campaign
 from continuum_loc.evaluation.error_tables import figures, per_ring, trial_rows
 from continuum_loc.evaluation.studies._soft_arm import FIDELITIES, soft_arm_trials
 from continuum_loc.evaluation.studies.table3 import of_fidelity
-from continuum_loc.evaluation.study import Claim, at_most, write_study
+from continuum_loc.evaluation.study import at_most, Claim, write_study
 from continuum_loc.evaluation.study_report import write_study_report
 from continuum_loc.robot import load_robot
 
 # Ring, base to tip: translation MAE (cm) and rotation MAE (deg) of the paper.
-PAPER = (("Top", 1.7, 1.3, 4.8, 4.1), ("Middle", 2.3, 1.2, 7.0, 3.4), ("Bottom (tip)", 3.6, 1.9, 9.9, 4.9))
+PAPER = (
+    ('Top', 1.7, 1.3, 4.8, 4.1),
+    ('Middle', 2.3, 1.2, 7.0, 3.4),
+    ('Bottom (tip)', 3.6, 1.9, 9.9, 4.9),
+)
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
@@ -23,26 +27,44 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     claims, tables = [], {}
     for fidelity in FIDELITIES:
         members = of_fidelity(outcomes, fidelity)
-        tables[f"table4_{fidelity}"] = _rows(members)
+        tables[f'table4_{fidelity}'] = _rows(members)
         claims += _judge(members, fidelity)
-    claims.append(at_most("trials that failed", sum(outcome.summary is None for outcome in outcomes), "", 0))
-    write_study(out, claims, seed=seed, settings={"trials": [outcome.trial for outcome in outcomes]},
-                tables={**tables, "trials": trial_rows(outcomes)}, extra={"quick": quick})
-    write_study_report(out, "Table IV: the soft arm, ring by ring", claims,
-                       {f"Errors, sensors as {name}": tables[f"table4_{name}"] for name in FIDELITIES}, outcomes)
+    claims.append(
+        at_most('trials that failed', sum(outcome.summary is None for outcome in outcomes), '', 0)
+    )
+    write_study(
+        out,
+        claims,
+        seed=seed,
+        settings={'trials': [outcome.trial for outcome in outcomes]},
+        tables={**tables, 'trials': trial_rows(outcomes)},
+        extra={'quick': quick},
+    )
+    write_study_report(
+        out,
+        'Table IV: the soft arm, ring by ring',
+        claims,
+        {f'Errors, sensors as {name}': tables[f'table4_{name}'] for name in FIDELITIES},
+        outcomes,
+    )
     return claims
 
 
 def _rings() -> list[tuple[str, tuple]]:
-    return list(zip(load_robot("soft_arm").ring_names, PAPER, strict=True))
+    return list(zip(load_robot('soft_arm').ring_names, PAPER, strict=True))
 
 
 def _rows(outcomes: list[Outcome]) -> list[dict[str, Any]]:
     rows = []
     for ring, (name, translation, spread, rotation, turn_spread) in _rings():
-        rows.append({"ring": name, **figures(outcomes, ring),
-                     "paper: translation MAE [cm]": f"{translation} ± {spread}",
-                     "paper: rotation MAE [deg]": f"{rotation} ± {turn_spread}"})
+        rows.append(
+            {
+                'ring': name,
+                **figures(outcomes, ring),
+                'paper: translation MAE [cm]': f'{translation} ± {spread}',
+                'paper: rotation MAE [deg]': f'{rotation} ± {turn_spread}',
+            }
+        )
     return rows
 
 
@@ -50,9 +72,17 @@ def _judge(outcomes: list[Outcome], fidelity: str) -> list[Claim]:
     """Every ring below the paper's."""
     claims = []
     for ring, (name, translation, _, rotation, _) in _rings():
-        for kind, key, factor, unit, limit in (("translation", "translation_mae_m", 100.0, "cm", translation),
-                                               ("rotation", "rotation_mae_deg", 1.0, "deg", rotation)):
+        for kind, key, factor, unit, limit in (
+            ('translation', 'translation_mae_m', 100.0, 'cm', translation),
+            ('rotation', 'rotation_mae_deg', 1.0, 'deg', rotation),
+        ):
             values = factor * per_ring(outcomes, key, ring)
-            claims.append(at_most(f"{fidelity}, {name}: {kind} MAE", values.mean() if len(values) else float("nan"),
-                                  unit, limit))
+            claims.append(
+                at_most(
+                    f'{fidelity}, {name}: {kind} MAE',
+                    values.mean() if len(values) else float('nan'),
+                    unit,
+                    limit,
+                )
+            )
     return claims
