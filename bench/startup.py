@@ -1,6 +1,7 @@
 """
-What one waits for before anything happens: import, help, the map, and the first estimate. Fresh
-processes.
+What one waits for before anything happens: import, help, the map, and the first estimate.
+
+Fresh processes.
 
 Kernels are compiled on the first run on a machine and kept; `startup, first estimate` has them
 kept. Memory is the process's greatest resident size at its end.

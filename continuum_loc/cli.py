@@ -1,6 +1,7 @@
 """
-The command line `continuum-loc`. Each command reads its arguments and calls the library; work is
-done there.
+The command line `continuum-loc`.
+
+Each command reads its arguments and calls the library; work is done there.
 
 Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input.
 """

@@ -30,7 +30,11 @@ S = TypeVar('S', bound=Settings)
 
 
 def load_settings(model: type[S], path: str | Path) -> S:
-    """Read a YAML file into `model`. Raises SettingsError naming the file, the key and the valid values."""
+    """
+    Read a YAML file into `model`.
+
+    Raises SettingsError naming the file, the key and the valid values.
+    """
     path = Path(path)
     try:
         data = yaml.safe_load(path.read_text())

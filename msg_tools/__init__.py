@@ -1,4 +1,8 @@
-"""ROS 2 messages and bags on one side, plain measurements on the other. Nothing here needs a ROS installation."""
+"""
+ROS 2 messages and bags on one side, plain measurements on the other.
+
+Nothing here needs a ROS installation.
+"""
 
 __all__ = ['BagError', 'BagWriter', 'ConvertError', 'read_bag']
 

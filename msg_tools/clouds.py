@@ -1,4 +1,8 @@
-"""PointCloud2 and structured arrays, either way. Any field order, datatype, padding and byte order is read."""
+"""
+PointCloud2 and structured arrays, either way.
+
+Any field order, datatype, padding and byte order is read.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,11 @@ _NUMBER = {np.dtype(code): number for number, code in DATATYPES.items()}
 
 
 def cloud_message(make: Messages, header: Any, array: np.ndarray) -> Any:
-    """PointCloud2 of a structured array, (H, W) organised or (N,) not. Fields are those of the dtype."""
+    """
+    PointCloud2 of a structured array, (H, W) organised or (N,) not.
+
+    Fields are those of the dtype.
+    """
     height, width = array.shape if array.ndim == 2 else (1, len(array))
     dtype = array.dtype
     fields = [
@@ -43,7 +51,11 @@ def cloud_message(make: Messages, header: Any, array: np.ndarray) -> Any:
 
 
 def cloud_array(message: Any, where: str) -> np.ndarray:
-    """(H, W) structured array viewing the cloud's bytes. Raises ConvertError starting with `where`."""
+    """
+    (H, W) structured array viewing the cloud's bytes.
+
+    Raises ConvertError starting with `where`.
+    """
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     _check_size(message, where)
     rows = np.frombuffer(message.data, np.uint8).reshape(height, int(message.row_step))[

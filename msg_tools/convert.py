@@ -74,7 +74,11 @@ def stamp_of(header: Any, where: str) -> int:
 
 
 def frame_of(header: Any, where: str) -> str:
-    """The header's frame without a leading slash (tf1's habit). Raises ConvertError where it is empty."""
+    """
+    The header's frame without a leading slash (tf1's habit).
+
+    Raises ConvertError where it is empty.
+    """
     frame = header.frame_id.lstrip('/')
     if not frame:
         raise ConvertError('frame', f'{where}: header.frame_id is empty; it must name the sensor')

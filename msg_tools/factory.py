@@ -1,4 +1,8 @@
-"""Where message classes come from: an installed ROS, or rosbags' own type store. Converters are handed one of these."""
+"""
+Where message classes come from: an installed ROS, or rosbags' own type store.
+
+Converters are handed one of these.
+"""
 
 from __future__ import annotations
 
@@ -68,8 +72,9 @@ def bag_messages() -> Messages:
 
 def deserialize(data: bytes, type_name: str):
     """
-    The rosbags message of serialised bytes (CDR with its 4-byte head). Raises rosbags' SerdeError
-    and others.
+    The rosbags message of serialised bytes (CDR with its 4-byte head).
+
+    Raises rosbags' SerdeError and others.
 
     rclpy's `serialize_message` may leave up to 8 bytes behind the message (it returns the
     estimated length), and bags written with it hold them; rosbags refuses more than 3. So such a

@@ -89,7 +89,11 @@ class _File:
 
 
 def read_recording(folder: str | Path, robot: RobotDescription) -> Recording:
-    """A trial's folder, for the robot whose description says which sensor sits where. Raises TrialError."""
+    """
+    A trial's folder, for the robot whose description says which sensor sits where.
+
+    Raises TrialError.
+    """
     folder = Path(folder)
     paths = sorted(folder.glob('*.csv'))
     if not paths:

@@ -1,4 +1,8 @@
-"""The contract of topics: name, type, quality of service, how its content is written and read. The only such list."""
+"""
+The contract of topics: name, type, quality of service, how its content is written and read.
+
+The only such list.
+"""
 
 from __future__ import annotations
 
@@ -133,7 +137,11 @@ OUTPUTS = (
 
 
 def topic_spec(name: str) -> Topic:
-    """The contract of a relative topic; `tracker/<sensor>` too. Raises ConvertError listing the valid names."""
+    """
+    The contract of a relative topic; `tracker/<sensor>` too.
+
+    Raises ConvertError listing the valid names.
+    """
     key = TRACKER if name.startswith(TRACKER) else name
     if key not in TOPICS or name == TRACKER:
         raise ConvertError(

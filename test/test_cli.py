@@ -1,4 +1,8 @@
-"""The command line: exit codes, errors in one line, help without heavy imports. Commands run in their own process."""
+"""
+The command line: exit codes, errors in one line, help without heavy imports.
+
+Commands run in their own process.
+"""
 
 import json
 import subprocess

@@ -106,7 +106,11 @@ def test_tilt_stays_and_yaw_drifts_by_the_residual_bias():
 
 
 def test_stated_covariance_is_the_spread_over_many_runs():
-    """400 filters over 10 s: a sample sigma is good to 3.5 %, so 20 % is beyond 5 sigma. The bias is known here."""
+    """
+    400 filters over 10 s: a sample sigma is good to 3.5 %, so 20 % is beyond 5 sigma.
+
+    The bias is known here.
+    """
     rng = np.random.default_rng(1)
     gyro_sigma, accel_sigma, found = 0.002, 0.05, []
     for _ in range(400):

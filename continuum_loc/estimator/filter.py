@@ -89,7 +89,11 @@ class SlidingWindowFilter:
     # -------------------------------------------------------------- measurements in, estimates out
 
     def process(self, measurement: Measurement) -> Estimate | None:
-        """Take one measurement; an Estimate when a step fell due. Measurements that cannot be used are counted."""
+        """
+        Take one measurement; an Estimate when a step fell due.
+
+        Measurements that cannot be used are counted.
+        """
         self.counts['received'][type(measurement).__name__] += 1
         estimate = self._step() if self._cycle_over(measurement) else None
         if self._admit(measurement) and self._cycle_complete(measurement):

@@ -94,9 +94,10 @@ class Priors:
 
     def _add_column(self, H: np.ndarray, g: np.ndarray, column: Column, share: float) -> float:
         """
-        Space prior, rest strain and base of one column. Rest strain and base pose are one
-        observation each, not
-        one per knot: a knot counts them by its `share` of the prior's memory.
+        Space prior, rest strain and base of one column.
+
+        Rest strain and base pose are one observation each, not one per knot: a knot counts them by
+        its `share` of the prior's memory.
         """
         squared = _add_space(
             H,

@@ -136,7 +136,11 @@ class Window:
     # ------------------------------------------------------------------ Gauss-Newton
 
     def track(self) -> tuple[int, bool]:
-        """Iterate from next to the minimum: (iterations, whether it converged). Raises SingularError."""
+        """
+        Iterate from next to the minimum: (iterations, whether it converged).
+
+        Raises SingularError.
+        """
         first, limit = len(self.intervals), self.settings.solver.max_iterations
         for iteration in range(1, limit + 1):
             first = min(first, self._linearise())
@@ -192,7 +196,11 @@ class Window:
         return changed[0] if changed else len(self.intervals)
 
     def _move(self, offsets: list[np.ndarray]) -> int:
-        """Take the offsets; columns that moved far get a new linearisation point. The first interval affected."""
+        """
+        Take the offsets; columns that moved far get a new linearisation point.
+
+        The first interval affected.
+        """
         first = len(self.intervals)
         far = self._pose_moves(offsets) >= self.settings.solver.relinearise
         for k, offset in enumerate(offsets):

@@ -39,7 +39,11 @@ class BagTrial:
 
 
 def bags_in(folder: Path) -> list[Path]:
-    """The bags directly in a folder: folders with a metadata.yaml, and single files. Raises BagsError."""
+    """
+    The bags directly in a folder: folders with a metadata.yaml, and single files.
+
+    Raises BagsError.
+    """
     if not folder.is_dir():
         raise BagsError(f'{folder}: no such folder; give one that holds bags')
     found = sorted(
@@ -63,7 +67,11 @@ def evaluate_bags(
     out: Path,
     jobs: int = 1,
 ) -> list[Claim]:
-    """Replay every bag of `folder`; tables, run folders and report go to `out`. The one claim is that none failed."""
+    """
+    Replay every bag of `folder`; tables, run folders and report go to `out`.
+
+    The one claim is that none failed.
+    """
     work = [(BagTrial(bag), robot, map_file, settings, out) for bag in bags_in(folder)]
     outcomes = sorted(
         show_progress(parallel(replay_bag, work, jobs), len(work), 'estimating'),

@@ -76,7 +76,11 @@ def _fell(row: dict[str, Any], old: dict[str, Any]) -> bool:
 
 
 def bench_names() -> list[str]:
-    """Names of the benchmarks in the source tree. Raises BenchError where there is no source tree."""
+    """
+    Names of the benchmarks in the source tree.
+
+    Raises BenchError where there is no source tree.
+    """
     if not BENCH_FOLDER.is_dir():
         raise BenchError(
             f'{BENCH_FOLDER}: no benchmarks; they are in the source tree, not in the installed package'

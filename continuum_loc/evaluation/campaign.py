@@ -72,7 +72,11 @@ def run_campaign(
 def record_bags(
     trials: Sequence[Trial], out: Path, jobs: int = 1, progress: Progress | None = None
 ) -> dict[str, str]:
-    """Simulate the recordings of `trials` that `out` does not hold yet. Returns {recording: error} of what failed."""
+    """
+    Simulate the recordings of `trials` that `out` does not hold yet.
+
+    Returns {recording: error} of what failed.
+    """
     progress = progress or show_progress
     bags = {trial.recording: trial for trial in trials if not bag_of(out, trial).is_dir()}
     failed = {}
@@ -84,7 +88,11 @@ def record_bags(
 
 
 def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]:
-    """Results of `work(*arguments)` as they come. A worker that dies ends the campaign; what is done stays done."""
+    """
+    Results of `work(*arguments)` as they come.
+
+    A worker that dies ends the campaign; what is done stays done.
+    """
     if SCHEDULER.get():
         yield from _distributed(work, arguments, SCHEDULER.get())
         return

@@ -1,4 +1,8 @@
-"""The plotly figures of a report. Each function takes results and gives one figure; none knows about HTML."""
+"""
+The plotly figures of a report.
+
+Each function takes results and gives one figure; none knows about HTML.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +41,9 @@ COMPONENTS = ('along x', 'along y', 'along z', 'about x', 'about y', 'about z')
 
 def error_figure(found: Errors, kind: str, lost: np.ndarray, epoch: int) -> go.Figure:
     """
-    One panel per ring: the error over time above its 3-sigma band. `kind` is `translation` or
-    `rotation`.
+    One panel per ring: the error over time above its 3-sigma band.
+
+    `kind` is `translation` or `rotation`.
 
     lost: (K,) bool, shaded. epoch: stamp of time zero.
     """

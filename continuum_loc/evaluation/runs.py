@@ -77,7 +77,11 @@ def save_run(
     configuration: Mapping[str, Any],
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Write the run's files (all but the report) and return its summary. `extra` adds keys to the summary."""
+    """
+    Write the run's files (all but the report) and return its summary.
+
+    `extra` adds keys to the summary.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     summary = {

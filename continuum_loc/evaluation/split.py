@@ -1,4 +1,8 @@
-"""Which trials the filter's numbers were tuned on. Tables may show them, claims may not rest on them."""
+"""
+Which trials the filter's numbers were tuned on.
+
+Tables may show them, claims may not rest on them.
+"""
 
 from __future__ import annotations
 

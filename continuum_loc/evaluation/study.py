@@ -85,7 +85,11 @@ def study_names() -> list[str]:
 
 
 def load_study(name: str) -> StudyRun:
-    """The `run` function of the study called `name`. Raises StudyError naming the nearest study."""
+    """
+    The `run` function of the study called `name`.
+
+    Raises StudyError naming the nearest study.
+    """
     names = study_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1, cutoff=0.0)

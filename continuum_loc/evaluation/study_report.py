@@ -22,7 +22,11 @@ def write_study_report(
     tables: dict[str, list[dict[str, Any]]],
     outcomes: Sequence[Outcome],
 ) -> Path:
-    """Write `out/report.html`. `tables` by title, as rows; the worst trial is the one with the greatest mean error."""
+    """
+    Write `out/report.html`.
+
+    `tables` by title, as rows; the worst trial is the one with the greatest mean error.
+    """
     ranked = sorted(
         (one for one in outcomes if one.summary is not None),
         key=lambda one: -(one.summary['translation_mae_m'] or 0.0),

@@ -1,6 +1,7 @@
 """
-One trial: a robot simulated in a scene, a prior map, and the filter over the samples. Studies,
-tests and the command line all build their trials here.
+One trial: a robot simulated in a scene, a prior map, and the filter over the samples.
+
+Studies, tests and the command line all build their trials here.
 """
 
 from __future__ import annotations
@@ -160,7 +161,11 @@ def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -
 
 
 def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> Path:
-    """The file of `scene_map`. Its name holds a digest of the mesh, so that a changed scene has a new map."""
+    """
+    The file of `scene_map`.
+
+    Its name holds a digest of the mesh, so that a changed scene has a new map.
+    """
     from continuum_loc.mapping.build import sample_mesh
     from continuum_loc.simulator.scenes import load_scene
 

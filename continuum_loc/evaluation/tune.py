@@ -113,8 +113,9 @@ def cost(translation_m: float, rotation_deg: float, nees_per_dof: float) -> floa
 
 def scaled(settings: EstimatorSettings, name: str, factor: float) -> EstimatorSettings:
     """
-    `settings` with the number (or tuple of numbers) at the dotted `name` times `factor`. Raises
-    SettingsError where the result is out of range, TuneError for a name that is none.
+    `settings` with the number (or tuple of numbers) at the dotted `name` times `factor`.
+
+    Raises SettingsError where the result is out of range, TuneError for a name that is none.
     """
     data: dict[str, Any] = settings.model_dump()
     group = data

@@ -113,7 +113,11 @@ def detect_anomalies(
     settings: AnomalySettings | None = None,
     index: VoxelIndex | None = None,
 ) -> list[AnomalyCluster]:
-    """All differences of both kinds, most confident first. `index`: of `prior`, if there is one already."""
+    """
+    All differences of both kinds, most confident first.
+
+    `index`: of `prior`, if there is one already.
+    """
     settings = settings or AnomalySettings()
     index = index or prior.index(reach=0.05)
     gone, through = missing_evidence(reconstruction, prior, settings, index)

@@ -249,9 +249,10 @@ def _poisson_subset(points, normals, spacing):
 @njit(cache=True)
 def _throw_darts(points, normals, cells, spacing, slots, following):
     """
-    Accept each point unless an accepted one of its side lies within `spacing`. Accepted points are
-    chained by hash of their cell (edge `spacing`); a chain may hold other cells' points, which the
-    distance test passes over.
+    Accept each point unless an accepted one of its side lies within `spacing`.
+
+    Accepted points are chained by hash of their cell (edge `spacing`); a chain may hold other
+    cells' points, which the distance test passes over.
     """
     accepted = np.zeros(points.shape[0], np.bool_)
     mask = slots.shape[0] - 1

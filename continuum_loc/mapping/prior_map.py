@@ -224,7 +224,11 @@ def _check_csv_header(path: Path) -> int:
 
 
 def _first_bad_line(path: Path, skipped: int, comma: bool) -> str | None:
-    """Which line of a table cannot be used, and how many are like it. Only read after a failure."""
+    """
+    Which line of a table cannot be used, and how many are like it.
+
+    Only read after a failure.
+    """
     width, first, count = None, None, 0
     with path.open(errors='replace') as stream:
         for number, line in enumerate(stream, start=1):

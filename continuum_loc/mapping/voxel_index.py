@@ -44,8 +44,9 @@ COUNTERS = (
 
 class VoxelArrays(NamedTuple):
     """
-    The index as arrays and scalars. Kernels take it whole; only `cell_slots` and `pool` are ever
-    written.
+    The index as arrays and scalars.
+
+    Kernels take it whole; only `cell_slots` and `pool` are ever written.
 
     Kept to few arrays on purpose: handing each one from kernel to kernel costs as much as a tenth
     of a lookup.

@@ -247,8 +247,9 @@ def with_base(
     robot: RobotDescription, T_map_base: np.ndarray, covariance: np.ndarray, insertion: float
 ) -> RobotDescription:
     """
-    The robot with its base at a pose (4, 4) given at the present insertion [m]. A covariance of
-    zeros keeps the robot's own.
+    The robot with its base at a pose (4, 4) given at the present insertion [m].
+
+    A covariance of zeros keeps the robot's own.
     """
     T_base_zero = np.eye(4)
     T_base_zero[0, 3] = -insertion

@@ -129,8 +129,9 @@ def rough_stamp(message: Any, arrival: int) -> int:
 
 class StampGate:
     """
-    Rules for stamps. `judge` returns None to use a sample, or the class of error under which it is
-    refused.
+    Rules for stamps.
+
+    `judge` returns None to use a sample, or the class of error under which it is refused.
 
     A leap beyond the tolerance is believed when `jump_confirmations` samples agree on it and none
     came meanwhile that

@@ -99,7 +99,11 @@ class SeenScene:
         )
 
     def _placed(self, frame: TofFrame, estimate: Estimate) -> np.ndarray:
-        """(N, 4) of the zones with a return. The standard deviation is the beam's and the ring's together, eq. 11."""
+        """
+        (N, 4) of the zones with a return.
+
+        The standard deviation is the beam's and the ring's together, eq. 11.
+        """
         ring = self._ring[frame.sensor]
         T_map_sensor = estimate.T_map_ring[ring] @ self._T_ring_sensor[frame.sensor]
         valid = np.isfinite(frame.ranges)

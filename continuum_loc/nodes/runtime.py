@@ -81,7 +81,11 @@ class PackageNode(Node):
 
 
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
-    """Make a node and spin it until it finishes or is told to stop. Returns the exit code (2: bad input)."""
+    """
+    Make a node and spin it until it finishes or is told to stop.
+
+    Returns the exit code (2: bad input).
+    """
     _provide_log_folder()
     try:
         rclpy.init(args=args)

@@ -1,4 +1,8 @@
-"""The parameters of each node. Names, defaults, limits and descriptions are here and nowhere else."""
+"""
+The parameters of each node.
+
+Names, defaults, limits and descriptions are here and nowhere else.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """
-TF: map -> base_link -> rings, and the static frames of sensors on their rings. Needs tf2_msgs,
-which not every installation has; `broadcaster` then gives None, and the node says so.
+TF: map -> base_link -> rings, and the static frames of sensors on their rings.
+
+Needs tf2_msgs, which not every installation has; `broadcaster` then gives None, and the node says
+so.
 """
 
 from __future__ import annotations

@@ -49,7 +49,11 @@ class GravityFilter:
     def start(
         self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0
     ) -> None:
-        """Begin at a known rotation with a gyro bias (3,) [rad/s]. Tilt is soon the accelerometer's own."""
+        """
+        Begin at a known rotation with a gyro bias (3,) [rad/s].
+
+        Tilt is soon the accelerometer's own.
+        """
         self.R_map_imu = np.array(R_map_imu, dtype=float)
         self.bias = np.array(bias, dtype=float)
         self._start, self.stamp, self._yaw_sigma, self._period = stamp, stamp, yaw_sigma, 0.0
@@ -100,7 +104,11 @@ class GravityFilter:
 
 @njit(cache=True)
 def _turn_and_level(R, rate, accel, dt, gain, gate):
-    """R <- R exp(rate dt), then turn it towards gravity by `gain` of the tilt error. False when gated."""
+    """
+    R <- R exp(rate dt), then turn it towards gravity by `gain` of the tilt error.
+
+    False when gated.
+    """
     _turn(R, rate[0] * dt, rate[1] * dt, rate[2] * dt)
     size = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
     if not abs(size - GRAVITY) <= gate:

@@ -36,7 +36,11 @@ class CalibrationError(ValueError):
 
 
 class ModuleCalibration(Settings):
-    """Corrections of one module, in its sensors' frames. Rotations turn the mount of the robot description."""
+    """
+    Corrections of one module, in its sensors' frames.
+
+    Rotations turn the mount of the robot description.
+    """
 
     gyro_bias: Vector3 = ZERO
     accel_offset: Vector3 = ZERO
@@ -142,8 +146,10 @@ def calibrate(
     model: FieldModel = 'ring',
 ) -> Calibration:
     """
-    Least squares over all rests. Raises CalibrationError for a reversed magnet, swapped modules, a
-    saturated channel, or rests that do not fit any correction of plausible size.
+    Least squares over all rests.
+
+    Raises CalibrationError for a reversed magnet, swapped modules, a saturated channel, or rests
+    that do not fit any correction of plausible size.
     """
     if not rests:
         raise CalibrationError('calibration needs at least one rest')
@@ -194,7 +200,11 @@ def check_wiring(robot: RobotDescription, posed: PosedRest, model: FieldModel = 
 
 
 def best_assignment(field: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(M,) order such that field[order] fits `expected` (M, 3) best by magnitude. Few modules: all are tried."""
+    """
+    (M,) order such that field[order] fits `expected` (M, 3) best by magnitude.
+
+    Few modules: all are tried.
+    """
     measured, wanted = (np.log(np.linalg.norm(b, axis=1) + 1e-9) for b in (field, expected))
     orders = np.array(list(permutations(range(len(field)))))
     return orders[np.argmin(((measured[orders] - wanted) ** 2).sum(axis=1))]

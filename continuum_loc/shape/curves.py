@@ -67,8 +67,9 @@ def projected_quadratic_bezier(
     points: np.ndarray, tangents: np.ndarray, samples: int
 ) -> np.ndarray:
     """
-    Eqs. 11-14. The control point is where neighbouring tangents meet; a chord where they do not
-    meet between.
+    Eqs. 11-14.
+
+    The control point is where neighbouring tangents meet; a chord where they do not meet between.
 
     The sign of the printed kappa (eq. 14) is the opposite of the intersection's and is mended
     here.

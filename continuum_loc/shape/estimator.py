@@ -187,7 +187,11 @@ class _Solution:
 
 
 class ShapeEstimator:
-    """See the module's docstring. `process` takes samples in any order of modules; stamps of one sensor ascend."""
+    """
+    See the module's docstring.
+
+    `process` takes samples in any order of modules; stamps of one sensor ascend.
+    """
 
     def __init__(
         self,
@@ -238,8 +242,9 @@ class ShapeEstimator:
 
     def process(self, sample: ImuSample | FieldSample) -> ShapeEstimate | None:
         """
-        Take one sample; an estimate when one fell due. Samples of other sensors are counted and
-        ignored.
+        Take one sample; an estimate when one fell due.
+
+        Samples of other sensors are counted and ignored.
 
         Raises ValueError for a sample that is not finite where a full scale cannot be the reason.
         """

@@ -74,7 +74,11 @@ def paper_pipeline(
     background: Background,
     mends: Iterable[str] = (),
 ) -> PaperEstimate:
-    """Eqs. 1-10 over a recording of an upright robot. Raises ValueError for a mend that does not exist."""
+    """
+    Eqs. 1-10 over a recording of an upright robot.
+
+    Raises ValueError for a mend that does not exist.
+    """
     mends = frozenset(mends)
     if mends - set(MENDS):
         raise ValueError(f'unknown mends {sorted(mends - set(MENDS))}; valid: {", ".join(MENDS)}')

@@ -33,7 +33,11 @@ class Rest:
 
 @dataclass(eq=False)
 class RestWindow:
-    """Collects the samples of one rest. Modules are numbered as the robot's `imu` and `hall` sensors."""
+    """
+    Collects the samples of one rest.
+
+    Modules are numbered as the robot's `imu` and `hall` sensors.
+    """
 
     robot: RobotDescription
     _rows: dict[tuple[str, str], list[np.ndarray]] = field(default_factory=dict)
@@ -69,8 +73,9 @@ class RestWindow:
 
     def finish(self) -> Rest:
         """
-        The means. Raises MotionError naming every sensor that moved, and ValueError for one that
-        was silent.
+        The means.
+
+        Raises MotionError naming every sensor that moved, and ValueError for one that was silent.
 
         A saturated channel is nan in the mean.
         """

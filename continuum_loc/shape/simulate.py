@@ -33,7 +33,11 @@ GROOVES = {
 
 
 class Imperfections(Settings):
-    """What the true arm has and the robot description does not say. All sigmas; zero makes a perfect arm."""
+    """
+    What the true arm has and the robot description does not say.
+
+    All sigmas; zero makes a perfect arm.
+    """
 
     mounting_deg: float = Field(
         0.5, ge=0.0, description='turn of every chip, about a random axis [deg]'

@@ -28,7 +28,11 @@ _log = logging.getLogger(__name__)
 
 
 def convex_pieces(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.ndarray, ...]:
-    """Vertices (n, 3) of each convex piece of a closed mesh. Raises SceneError, naming `where`, if CoACD fails."""
+    """
+    Vertices (n, 3) of each convex piece of a closed mesh.
+
+    Raises SceneError, naming `where`, if CoACD fails.
+    """
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder, 'mesh.npz'), Path(folder, 'pieces.npz')
         np.savez(source, vertices=vertices, faces=faces)

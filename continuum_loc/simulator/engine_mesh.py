@@ -71,8 +71,10 @@ class BladeRow:
 
     def sections(self, index: int) -> np.ndarray:
         """
-        (m, n, 3) sections of blade `index`, hub to casing. Blades differ by their place in the
-        row: a little stagger, chord and azimuth each, as in a real, mistuned row.
+        (m, n, 3) sections of blade `index`, hub to casing.
+
+        Blades differ by their place in the row: a little stagger, chord and azimuth each, as in a
+        real, mistuned row.
         """
         variation = np.random.default_rng([self.count, index]).uniform(-1.0, 1.0, 3)
         radii = np.linspace(*self._span(), _SPAN_SECTIONS)

@@ -54,8 +54,10 @@ def build_spec(
     supported: bool = False,
 ) -> mujoco.MjSpec:
     """
-    The model before compilation. `scene` gives the convex pieces to collide with, None the empty
-    space; `supported` lets something else carry the rod's weight.
+    The model before compilation.
+
+    `scene` gives the convex pieces to collide with, None the empty space; `supported` lets
+    something else carry the rod's weight.
     """
     import mujoco
 
@@ -141,8 +143,9 @@ def uniform_rod(
     time_step: float = 0.005,
 ) -> mujoco.MjModel:
     """
-    A plain rod along x, clamped at the origin, for comparison with mechanics. Its last body,
-    `tip`, has no mass and lies at the rod's end: loads go there.
+    A plain rod along x, clamped at the origin, for comparison with mechanics.
+
+    Its last body, `tip`, has no mass and lies at the rod's end: loads go there.
     """
     robot = RobotDescription(
         name='rod', length=length, radius=0.01 * length, rings=(Ring(name='end', s=length),)

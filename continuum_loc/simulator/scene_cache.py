@@ -19,7 +19,11 @@ import numpy as np
 
 
 def cached_scene(name: str, made_from: Iterable[Path], build: Callable[[], Scene]) -> Scene:
-    """The scene `name` from the cache, or built and put there. `made_from`: files whose content decides the scene."""
+    """
+    The scene `name` from the cache, or built and put there.
+
+    `made_from`: files whose content decides the scene.
+    """
     digest = hashlib.sha256()
     for path in sorted(made_from):
         digest.update(path.read_bytes())

@@ -82,7 +82,11 @@ class StrainSensor:
         self.segment = np.clip(np.searchsorted(nodes_s, stations + 1e-9) - 1, 0, len(nodes_s) - 2)
 
     def measure(self, stamp: int, segment_strain: np.ndarray) -> StrainSample:
-        """segment_strain: (N, 6) of `motion.segment_strain`. The strain is kappa (0, -sin theta, cos theta)."""
+        """
+        segment_strain: (N, 6) of `motion.segment_strain`.
+
+        The strain is kappa (0, -sin theta, cos theta).
+        """
         _, bend_y, bend_z = segment_strain[self.segment, 3:].T
         theta = np.arctan2(-bend_y, bend_z) + self.model.theta_sigma * self._rng.standard_normal(
             len(self.stations)
@@ -115,7 +119,11 @@ class HallSensors:
     def measure(
         self, stamp: int, T_map_hall: np.ndarray, T_map_magnet: np.ndarray
     ) -> list[FieldSample]:
-        """T_map_hall (H, 4, 4). Axes beyond full scale read nan; the rest are rounded to the step."""
+        """
+        T_map_hall (H, 4, 4).
+
+        Axes beyond full scale read nan; the rest are rounded to the step.
+        """
         field = np.einsum(
             'hab,ha->hb', T_map_hall[:, :3, :3], self.true_field(T_map_hall, T_map_magnet)
         )

@@ -58,7 +58,11 @@ def vertices_of(solid: Manifold) -> np.ndarray:
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
-    """The solid inside a closed mesh. Raises ValueError where the mesh is not a closed, oriented surface."""
+    """
+    The solid inside a closed mesh.
+
+    Raises ValueError where the mesh is not a closed, oriented surface.
+    """
     # Copies: the binding takes no read-only arrays.
     solid = Manifold(
         Mesh64(np.array(vertices, dtype=np.float64, order='C'), faces.astype(np.uint64))

@@ -49,7 +49,11 @@ class Readings:
 
 
 class Receiver(Protocol):
-    """Turns echoes into readings. `directions` (K, 3) are the rays that it needs, in the sensor frame."""
+    """
+    Turns echoes into readings.
+
+    `directions` (K, 3) are the rays that it needs, in the sensor frame.
+    """
 
     directions: np.ndarray
 
@@ -125,8 +129,10 @@ class TofSensorModel:
 
 class PaperReceiver:
     """
-    One ray per zone. Noise: N(0, sigma(d)) of Table I on the raw distance d, along the ray or
-    along the optical axis as the model's convention has it.
+    One ray per zone.
+
+    Noise: N(0, sigma(d)) of Table I on the raw distance d, along the ray or along the optical axis
+    as the model's convention has it.
     """
 
     def __init__(self, tof_model: TofModel) -> None:

@@ -348,7 +348,11 @@ def _free(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajector
 
 
 def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
-    """From straight into the groove within three seconds, then still. Uniform moment bends a uniform rod to an arc."""
+    """
+    From straight into the groove within three seconds, then still.
+
+    Uniform moment bends a uniform rod to an arc.
+    """
     curvature = _GROOVES[name] * np.array([0.0, 1.0, 1.0])
     moments = plant.EI * np.stack([curvature, np.zeros(3)], axis=-1)[:, None, :]
     times = np.array([REST, REST + 3.0, REST + 9.0])

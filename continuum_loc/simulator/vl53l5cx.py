@@ -56,7 +56,11 @@ class Vl53l5cxSettings(Settings):
 
 
 class Vl53l5cxReceiver:
-    """Turns sub-ray echoes into readings. It remembers which zones had a target in the frame before (status 10)."""
+    """
+    Turns sub-ray echoes into readings.
+
+    It remembers which zones had a target in the frame before (status 10).
+    """
 
     def __init__(self, tof_model: TofModel, settings: Vl53l5cxSettings | None = None) -> None:
         self._model, self._settings = tof_model, settings or Vl53l5cxSettings()

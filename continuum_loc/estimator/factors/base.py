@@ -52,7 +52,11 @@ class Factor(ABC):
 
     @abstractmethod
     def row(self, measurement: Any) -> tuple:
-        """The measurement in the body frame of its node. Raises MeasurementError where it cannot be used."""
+        """
+        The measurement in the body frame of its node.
+
+        Raises MeasurementError where it cannot be used.
+        """
 
     @abstractmethod
     def stack(self, times: np.ndarray, rows: list[tuple]) -> tuple:

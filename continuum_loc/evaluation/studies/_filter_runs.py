@@ -58,8 +58,9 @@ class Case:
 @dataclass(frozen=True, eq=False)
 class CaseResult:
     """
-    What became of a case. Without a run, `error` says why; the arrays are over the steps where
-    truth is known.
+    What became of a case.
+
+    Without a run, `error` says why; the arrays are over the steps where truth is known.
 
     times: (K,) s since the filter's first sample. status: (K,). found: errors. For every step of
     `steps` (S,) s,
@@ -129,7 +130,11 @@ def run_cases(cases: Sequence[Case], out: Path, jobs: int) -> list[CaseResult]:
 
 
 def replay_case(out: Path, case: Case) -> tuple[str, str]:
-    """Replay a case into its run folder unless it is there. Returns (its folder's name, what went wrong or "")."""
+    """
+    Replay a case into its run folder unless it is there.
+
+    Returns (its folder's name, what went wrong or "").
+    """
     folder = out / 'cases' / case.folder
     try:
         _replay(out, case, folder)
