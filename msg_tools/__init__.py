@@ -4,17 +4,14 @@ ROS 2 messages and bags on one side, plain measurements on the other.
 Nothing here needs a ROS installation.
 """
 
-__all__ = ['BagError', 'BagWriter', 'ConvertError', 'read_bag']
+from importlib import import_module
+
+_HOMES = {'BagError': 'bag', 'BagWriter': 'bag', 'ConvertError': 'errors', 'read_bag': 'bag'}
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str):
     """Load the bag reader and the converters only when somebody asks for them."""
-    if name in ('BagError', 'BagWriter', 'read_bag'):
-        from msg_tools import bag
-
-        return getattr(bag, name)
-    if name == 'ConvertError':
-        from msg_tools.errors import ConvertError
-
-        return ConvertError
-    raise AttributeError(f"module 'msg_tools' has no attribute '{name}'")
+    if name not in _HOMES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)

@@ -1,12 +1,14 @@
 """
-Least squares on a chain of columns: block-tridiagonal elimination, marginalisation and
-covariances.
+Least squares on a chain of columns.
 
-Interval k couples columns k and k + 1 by a quadratic  1/2 [x_k; x_k+1]^T H [x_k; x_k+1] + g^T [x_k; x_k+1]  in the
-columns' offsets x from their linearisation points. Eliminating columns from the oldest to the newest leaves on each
-a *message* (Lambda, eta), all that the past says of it:
+Block-tridiagonal elimination, marginalisation and covariances.
 
-    S_k = Lambda_k + H_aa,   Lambda_k+1 = H_bb - H_ab^T S_k^-1 H_ab,   eta_k+1 = g_b - H_ab^T S_k^-1 (eta_k + g_a).
+Interval k couples columns k and k + 1 by a quadratic  1/2 [x_k; x_k+1]^T H [x_k; x_k+1] + g^T
+[x_k; x_k+1]  in the columns' offsets x from their linearisation points. Eliminating columns from
+the oldest to the newest leaves on each a *message* (Lambda, eta), all that the past says of it:
+
+    S_k = Lambda_k + H_aa,
+    Lambda_k+1 = H_bb - H_ab^T S_k^-1 H_ab,   eta_k+1 = g_b - H_ab^T S_k^-1 (eta_k + g_a).
 
 Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the
 message it left. Messages before the first interval that changed are kept from the last solve, and
@@ -27,15 +29,19 @@ class SingularError(ArithmeticError):
 
     def __init__(self, column: int):
         super().__init__(
-            f'the information of column {column} is not positive definite: some of its directions are '
-            'not observed by any measurement or prior'
+            f'the information of column {column} is not positive definite: some of its '
+            'directions are not observed by any measurement or prior'
         )
         self.column = column
 
 
 @dataclass(slots=True, eq=False)
 class Blocks:
-    """Normal equations of one interval: H (2 D, 2 D) symmetric, g (2 D,), and the cost at the linearisation point."""
+    """
+    Normal equations of one interval, at its linearisation point.
+
+    H (2 D, 2 D) symmetric, g (2 D,), and the cost.
+    """
 
     H: np.ndarray
     g: np.ndarray
@@ -53,7 +59,11 @@ class Blocks:
 
 @dataclass(slots=True, eq=False)
 class Message:
-    """What the past says of a column: information (D, D) and gradient (D,) at its linearisation point."""
+    """
+    What the past says of a column, at its linearisation point.
+
+    Information (D, D) and gradient (D,).
+    """
 
     information: np.ndarray
     gradient: np.ndarray
@@ -61,7 +71,7 @@ class Message:
 
 @dataclass(slots=True, eq=False)
 class _Elimination:
-    """One eliminated column: L (lower Cholesky factor of S), Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
+    """One eliminated column: L (lower Cholesky of S), Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
 
     L: np.ndarray
     Y: np.ndarray
@@ -69,7 +79,7 @@ class _Elimination:
 
 
 class Chain:
-    """The elimination of a window's intervals, with what can be kept from one solve to the next."""
+    """Elimination of a window's intervals, with what can be kept from one solve to the next."""
 
     def __init__(self, dim: int, start: Message):
         self.dim = dim
@@ -90,8 +100,9 @@ class Chain:
 
     def covariance(self, column: int, A: np.ndarray, B: np.ndarray | None = None) -> np.ndarray:
         """
-        Covariance (m, m) of A x + B x', with A, B (m, D), of the offsets x of a column and x' of
-        the next one.
+        Covariance (m, m) of A x + B x' of the offsets x of a column and x' of the next.
+
+        A, B (m, D).
 
         With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero
         above `column`: the cost grows with the columns after it, not with the window.
@@ -113,8 +124,9 @@ class Chain:
 
     def forget_oldest(self, oldest: Blocks, changed: bool) -> None:
         """
-        Marginalise the oldest column through its interval: its message to the next becomes the
-        start.
+        Marginalise the oldest column through its interval.
+
+        Its message to the next column becomes the start.
 
         `changed` says that the interval is not the one of the last solve, so that it must be
         eliminated anew.
@@ -153,7 +165,7 @@ def _cholesky(S: np.ndarray, damping: float, column: int) -> np.ndarray:
 
 
 def _symmetrised(lower: np.ndarray) -> np.ndarray:
-    """The full matrix of one whose lower triangle alone was updated."""
+    """Full symmetric matrix of one whose lower triangle alone was updated."""
     _mirror(lower)
     return lower
 

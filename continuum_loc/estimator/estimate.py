@@ -13,8 +13,9 @@ Status = Literal['initialising', 'tracking', 'lost']
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """
-    The body at one instant: its base and R rings (in the robot description's order), and its
-    backbone.
+    The body at one instant.
+
+    Its base and R rings (in the robot description's order), and its backbone.
 
     stamp: integer ns of the instant.
     T_map_ring: (R + 1, 4, 4) poses, the base first.

@@ -120,8 +120,7 @@ class SlidingWindowFilter:
 
     def resolve(self, stamps: Sequence[int]) -> list[Estimate]:
         """
-        Linearise the whole window anew until it converges, and give its estimates at `stamps`
-        [ns].
+        Linearise the whole window anew until it converges; its estimates at `stamps` [ns].
 
         Raises ValueError for a stamp outside the window.
         """
@@ -135,8 +134,8 @@ class SlidingWindowFilter:
                 time = seconds(stamp, self.epoch)
                 if not first - TIME_EPSILON <= time <= last + TIME_EPSILON:
                     raise ValueError(
-                        f'stamp {stamp} is outside the window, {self.epoch + nanoseconds(first)} to '
-                        f'{self.newest} ns'
+                        f'stamp {stamp} is outside the window, '
+                        f'{self.epoch + nanoseconds(first)} to {self.newest} ns'
                     )
                 out.append(self._compose(time, fit, iterations, converged, started, None))
         return out
@@ -188,7 +187,11 @@ class SlidingWindowFilter:
         return again or seconds(measurement.stamp, self._cycle_start) >= period - TIME_EPSILON
 
     def _cycle_complete(self, measurement: Measurement) -> bool:
-        """Note the measurement in the running cycle; True when every ToF sensor of the last cycle has spoken."""
+        """
+        Note the measurement in the running cycle.
+
+        True when every ToF sensor of the last cycle has spoken.
+        """
         self._cycle_start = self._cycle_start or measurement.stamp
         if self.tof is None or not isinstance(measurement, TofFrame):
             return False
@@ -233,7 +236,11 @@ class SlidingWindowFilter:
         return iterations, converged
 
     def _guess_shape(self) -> None:
-        """Start from the first strain and insertion measured, where there are any, rather than from straight."""
+        """
+        Start from the first strain and insertion measured, where there are any.
+
+        Without them the guess is straight.
+        """
         column = self.window.columns[0]
         strain, T_base = column.strain.copy(), column.T[0]
         for factor in self.factors:

@@ -1,4 +1,8 @@
-"""The stretch between two knots: its measurements, and their normal equations at the current linearisation."""
+"""
+The stretch between two knots.
+
+Its measurements, and their normal equations at the current linearisation.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,7 @@ class Interval:
         self.changed = True
 
     def rows(self, factor: Factor) -> list[tuple]:
-        """The rows of one factor, in order of arrival."""
+        """Rows of one factor, in order of arrival."""
         return self._rows.get(factor, [])
 
     def linearise(self, priors: Priors, a: Column, b: Column) -> None:

@@ -1,4 +1,4 @@
-"""From columns and their covariances to what is published: the body at any instant and arclength."""
+"""From columns and their covariances to what is published: the body at any instant and place."""
 
 from __future__ import annotations
 
@@ -39,8 +39,9 @@ class BodyState:
 
 def body_between(a: Column, b: Column, time: float) -> Body:
     """
-    The body at `time` between two columns: pose and velocity by the Gaussian process's cubic
-    Hermite, strain linearly.
+    Interpolate the body at `time` between two columns.
+
+    Pose and velocity by the Gaussian process's cubic Hermite, strain linearly.
     """
     nodes, d = len(a.T), b.time - a.time
     T, velocity = np.empty((nodes, 4, 4)), np.empty((nodes, 6))
@@ -66,8 +67,9 @@ def interpolated_poses(
     a: Column, b: Column, tau: np.ndarray, nodes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Poses (m, 4, 4) of `nodes` (m,) at times tau (m,) after column a, and their Jacobians (m, 6,
-    24) by [delta_a, v_a, delta_b, v_b] of the node.
+    Poses (m, 4, 4) of `nodes` (m,) at times tau (m,) after column a, and their Jacobians.
+
+    The Jacobians (m, 6, 24) are by [delta_a, v_a, delta_b, v_b] of the node.
     """
     m = len(nodes)
     T, J_pose = np.empty((m, 4, 4)), np.empty((m, 6, 24))
@@ -91,7 +93,11 @@ def interpolated_poses(
 def motion_jacobians(
     a: Column, b: Column, time: float, nodes: np.ndarray, dim: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobians A, B (12 m, D) of [pose, velocity] of `nodes` (m,) at `time`, by the offsets of the two columns."""
+    """
+    Jacobians A, B (12 m, D) of [pose, velocity] of `nodes` (m,) at `time`.
+
+    They are by the offsets of the two columns.
+    """
     m, d, tau = len(nodes), b.time - a.time, time - a.time
     J = np.empty((m, 12, 24))
     _interpolate(
@@ -124,8 +130,9 @@ def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -
 @njit(cache=True)
 def _interpolate(T_a, v_a, T_b, v_b, d, tau, from_a, from_b, T, v, J_pose, J_rate):
     """
-    `gp.hermite` for many: element m goes from T_a[from_a[m]] to T_b[from_b[m]] at tau[m]; the
-    Jacobians are written where J_pose has room.
+    `gp.hermite` for many: element m goes from T_a[from_a[m]] to T_b[from_b[m]] at tau[m].
+
+    The Jacobians are written where J_pose has room.
     """
     W, V, M = lie_kernels.workspace()
     J_work, pose, rate = np.empty((2, 6, 24)), np.empty((6, 24)), np.empty((6, 24))

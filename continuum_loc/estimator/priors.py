@@ -1,6 +1,7 @@
 """
-Prior factors of one interval: the Gaussian process in time and in arclength, rest strain, base and
-bias.
+Prior factors of one interval.
+
+The Gaussian process in time and in arclength, rest strain, base and bias.
 
 An interval holds the time prior between its two columns and the factors of the *newer* column
 alone (its space prior, rest strain, base); those of the very first column are in the start
@@ -56,7 +57,9 @@ class Priors:
 
     def start(self, column: Column, moving: bool = False) -> Message:
         """
-        The first column's own factors, linearised there: what is known before any measurement.
+        Return the first column's own factors, linearised there.
+
+        They are what is known before any measurement.
 
         `moving` loosens the velocity, for a body found in the middle of its motion.
         """

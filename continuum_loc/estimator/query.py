@@ -1,4 +1,8 @@
-"""The continuous state: mean and covariance at any time and arclength, in the window, behind it and ahead of it."""
+"""
+Mean and covariance of the state at any time and arclength.
+
+In the window, behind it and ahead of it.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ class PastColumn:
 
 
 class History:
-    """Columns behind the window, as far back as `duration` [s]: memory does not grow with the run."""
+    """Columns behind the window, back to `duration` [s]: memory does not grow with the run."""
 
     def __init__(self, duration: float):
         self._duration = duration
@@ -32,8 +36,9 @@ class History:
 
     def note(self, window: Window) -> None:
         """
-        Keep a column once `SMOOTHED_BY` later ones have smoothed it; more of them would change it
-        little and cost much.
+        Keep a column once `SMOOTHED_BY` later ones have smoothed it.
+
+        More of them would change it little and cost much.
         """
         k = len(window.columns) - 1 - SMOOTHED_BY
         if self._duration <= 0.0 or k < 0:
@@ -48,7 +53,11 @@ class History:
             self._columns.popleft()
 
     def around(self, time: float) -> tuple[PastColumn, PastColumn]:
-        """The two columns that enclose `time`. Raises ValueError where there are none."""
+        """
+        Return the two columns that enclose `time`.
+
+        Raises ValueError where there are none.
+        """
         for older, newer in zip(self._columns, list(self._columns)[1:], strict=False):
             if older.column.time - TIME_EPSILON <= time <= newer.column.time + TIME_EPSILON:
                 return older, newer
@@ -61,7 +70,7 @@ class History:
 
 
 def state_at(window: Window, history: History, time: float, s: float) -> BodyState:
-    """The state at `time` [s since the epoch] and arclength s [m]."""
+    """Evaluate the state at `time` [s since the epoch] and arclength s [m]."""
     n, offset = window.grid.segment(s)
     if time > window.columns[-1].time:
         T, strain, velocity, P = _ahead(window, time, n)
@@ -166,8 +175,10 @@ def _ahead(window: Window, time: float, n: int):
 
 def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd) -> BodyState:
     """
-    From two nodes to an arclength between them: pose and strain by the same Hermite in s, velocity
-    linearly in the frames that the exact adjoint carries from the nearer node.
+    From two nodes to an arclength between them.
+
+    Pose and strain by the same Hermite in s, velocity linearly in the frames that the exact
+    adjoint carries from the nearer node.
     """
     ds, m = grid.s[n + 1] - grid.s[n], NODE_DIM
     T_s, strain_s, J_pose, J_rate = gp.interpolate(T[0], strain[0], T[1], strain[1], ds, offset)

@@ -1,6 +1,7 @@
 """
-Lost and found: noticing that the body is in a wrong minimum, and finding it from the base and the
-map alone.
+Lost and found: noticing that the body is in a wrong minimum, and finding it again.
+
+The search needs the base and the map alone.
 
 A wrong minimum shows in the share of ToF zones that fit the map. A low share alone is no proof
 (the scene may differ from the map), so a suspicion leads to a search of all shapes: where nothing
@@ -42,7 +43,11 @@ BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stay
 
 @dataclass(slots=True)
 class Watch:
-    """Whether the body is to be believed: suspicion, and when to search next (times in seconds of data)."""
+    """
+    Whether the body is to be believed.
+
+    Suspicion, and when to search next (times in seconds of data).
+    """
 
     settings: RecoverySettings
     since: float | None = None
@@ -117,7 +122,7 @@ class Recovery:
 
     @property
     def status(self) -> Status:
-        """What to tell of the body."""
+        """Say what to tell of the body."""
         if self._watch.lost:
             return 'lost'
         return 'tracking' if self.acquired else 'initialising'
@@ -127,7 +132,11 @@ class Recovery:
         self._heard[sensor] = max(time, self._heard.get(sensor, time))
 
     def doubt(self, s: np.ndarray) -> np.ndarray:
-        """(m, 6, 6) covariance to add at arclengths s (m,) while in doubt or lost; it grows from base to tip."""
+        """
+        (m, 6, 6) covariance to add at arclengths s (m,) while in doubt or lost.
+
+        It grows from base to tip.
+        """
         reach = self._doubt * (s / self._window.grid.s[-1])[:, None]
         return np.square(reach * np.repeat(self._settings.lost_sigma, 3))[:, :, None] * np.eye(6)
 
@@ -146,7 +155,11 @@ class Recovery:
         return outcome
 
     def look_after(self, time: float, converged: bool) -> None:
-        """Notice a wrong minimum by the worst ring's share of fitting zones, and look for a better body."""
+        """
+        Notice a wrong minimum by the worst ring's share of fitting zones.
+
+        Then look for a better body.
+        """
         silent = self._silent(time)
         misfits = self._misfits() + silent
         if self._tof is None or not self._settings.enabled:
@@ -175,7 +188,7 @@ class Recovery:
         self._doubt = self._how_doubtful(self._worst_share())
 
     def _narrow(self, iteration: int) -> bool:
-        """The gate of association: wide while the shape is a guess, then down to the tracking gate."""
+        """Gate association: wide while the shape is a guess, then down to the tracking gate."""
         options = self._tof.settings.tof
         gate = max(options.gate, options.acquisition_gate * GATE_SHRINK**iteration)
         if gate != self._tof.gate:
@@ -185,8 +198,9 @@ class Recovery:
 
     def _worst_share(self) -> float:
         """
-        Least share of fitting zones over the rings, in the newest interval that has ToF frames;
-        sensors that are themselves suspect do not count.
+        Least share of fitting zones over the rings, in the newest interval with ToF frames.
+
+        Sensors that are themselves suspect do not count.
         """
         fits = self._window.newest_fits('tof')
         by_ring: dict[str, np.ndarray] = {}
@@ -196,7 +210,11 @@ class Recovery:
         return min((fit[1] / fit[0] for fit in by_ring.values() if fit[0] > 0), default=1.0)
 
     def _misfits(self) -> list[str]:
-        """Sensors that do not fit while others of their kind do: a wrong extrinsic, a wrong clock, a broken part."""
+        """
+        Sensors that do not fit while others of their kind do.
+
+        A wrong extrinsic, a wrong clock, a broken part.
+        """
         shares, misfits = self._window.fit().shares, []
         for sensors in (self._robot.tof, self._robot.imu):
             names = [sensor.name for sensor in sensors if sensor.name in shares]
@@ -207,7 +225,11 @@ class Recovery:
         return misfits
 
     def _silent(self, time: float) -> list[str]:
-        """Sensors without a usable sample for long (silent, frozen or refused) while others of their kind speak."""
+        """
+        Sensors without a usable sample for long while others of their kind speak.
+
+        They are silent, frozen or refused.
+        """
         silent = []
         for sensors in (self._robot.tof if self._tof is not None else (), self._robot.imu):
             ages = {sensor.name: time - self._heard.get(sensor.name, 0.0) for sensor in sensors}
@@ -216,7 +238,11 @@ class Recovery:
         return silent
 
     def _how_doubtful(self, share: float) -> float:
-        """1 while lost; while suspect and not yet searched, as far as the worst ring's share has sunk; else 0."""
+        """
+        1 while lost; while suspect and not yet searched, the less the worst ring's share, the nearer 1.
+
+        Else 0.
+        """
         if self._watch.lost:
             return 1.0
         if self._watch.since is None or self._watch.backoff > 1.0:
@@ -231,9 +257,9 @@ class Recovery:
 
     def _search(self) -> bool:
         """
-        Try the shapes that a search finds, take one that fits better than the present body; True
-        when the body that
-        results is to be believed: no other one fits as well.
+        Try the shapes that a search finds, and take one that fits better than the present body.
+
+        True when the body that results is to be believed: no other one fits as well.
         """
         window, rings = self._window, self._window.grid.ring_nodes
         rows = window.newest_rows(self._tof, SEARCH_INTERVALS)
@@ -287,7 +313,7 @@ class ShapeSearch:
 
     @property
     def _map(self) -> tuple:
-        """The thinned map, made at the first search."""
+        """Return the thinned map, made at the first search."""
         if self._thinned is None:
             self._thinned = thinned(self._tof, COARSE_SPACING, self.settings.score_gate)
         return self._thinned
@@ -334,7 +360,7 @@ class ShapeSearch:
         )
 
     def _different(self, total: np.ndarray, T: np.ndarray) -> np.ndarray:
-        """The best `beam` candidates no two of which lie within `distinct` of one another."""
+        """Best `beam` candidates, no two of which lie within `distinct` of one another."""
         chosen: list[int] = []
         for candidate in np.argsort(total, kind='stable'):
             gaps = [np.linalg.norm(T[candidate, :3, 3] - T[c, :3, 3]) for c in chosen]
@@ -355,8 +381,10 @@ class ShapeSearch:
 
 def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
     """
-    The map's arrays for the kernels with one point for each cell of `spacing` and each octant of
-    the normal, so that both sides of a thin blade stay.
+    Thin the map's arrays for the kernels.
+
+    One point for each cell of `spacing` and each octant of the normal, so that both sides of a
+    thin blade stay.
     """
     from continuum_loc.mapping.voxel_index import VoxelIndex
 
@@ -375,7 +403,7 @@ def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
 
 
 def place(grid: Grid, column: Column, T_map_base: np.ndarray, strain: np.ndarray) -> Column:
-    """The column put motionless into another shape; its biases stay."""
+    """Place the column motionless in another shape; its biases stay."""
     return Column(
         column.time,
         shape_from_strain(T_map_base, grid.s, strain),

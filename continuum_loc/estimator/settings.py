@@ -1,4 +1,8 @@
-"""Every number of the filter that can be tuned, with its unit; `continuum-loc tune` writes such a file."""
+"""
+Every number of the filter that can be tuned, with its unit.
+
+`continuum-loc tune` writes such a file.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,11 @@ PRESETS_FOLDER = Path(__file__).parent / 'presets'
 
 
 class PriorSettings(Settings):
-    """Process noise: power spectral densities per component [translation; rotation] of body-frame rates."""
+    """
+    Process noise: power spectral densities by component of body-frame rates.
+
+    Components are [translation; rotation].
+    """
 
     velocity: Vector6 = Field(
         (0.1, 0.1, 0.1, 3.0, 3.0, 3.0),
@@ -100,7 +108,11 @@ class GyroSettings(Settings):
 
 
 class StrainSettings(Settings):
-    """Strain factors: the two curvatures only, as (theta, kappa) says nothing of the other components."""
+    """
+    Strain factors: the two curvatures only.
+
+    (theta, kappa) says nothing of the other components.
+    """
 
     enabled: bool = True
     scale: float = Field(1.5, gt=0.0, description="factor on the datasheet's noise")
@@ -236,8 +248,8 @@ class EstimatorSettings(Settings):
     )
     calibration_sigma: tuple[float, float] = Field(
         (0.0, 0.0),
-        description="spread that mounting errors leave on each ring's pose, which no averaging removes; "
-        'added to the published covariance [m, rad]',
+        description="spread that mounting errors leave on each ring's pose, which no averaging "
+        'removes; added to the published covariance [m, rad]',
     )
     backbone_points: int = Field(61, ge=2, description='poses of the published backbone')
     prior: PriorSettings = PriorSettings()
@@ -253,8 +265,10 @@ class EstimatorSettings(Settings):
 
 def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSettings:
     """
-    The settings to use for a robot: those `given` by name or file, else the preset of the robot's
-    name, else the defaults, for a robot of your own.
+    Choose the settings to use for a robot.
+
+    Those `given` by name or file, else the preset of the robot's name, else the defaults, for a
+    robot of your own.
     """
     if given:
         return load_estimator_settings(given)
@@ -263,5 +277,9 @@ def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSe
 
 
 def load_estimator_settings(name_or_path: str | Path) -> EstimatorSettings:
-    """Settings that come with the package by the robot's name (`engine`, `soft_arm`), or from a YAML file."""
+    """
+    Load settings from a YAML file, or the package's own by the robot's name.
+
+    The package has `engine` and `soft_arm`.
+    """
     return load_bundled(EstimatorSettings, PRESETS_FOLDER, name_or_path, 'estimator settings')

@@ -1,4 +1,8 @@
-"""The batch smoother: the same factors over a whole recording, nothing marginalised; the accuracy reference."""
+"""
+Batch smoother: the same factors over a whole recording, nothing marginalised.
+
+It is the accuracy reference.
+"""
 
 from __future__ import annotations
 

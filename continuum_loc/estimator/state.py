@@ -21,8 +21,9 @@ POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
 
 class Grid:
     """
-    Where the nodes are: at the base, at every ring and the tip, and in between no farther than
-    `spacing`.
+    Where the nodes are: at the base, at every ring and the tip, and in between.
+
+    In between, no farther apart than `spacing`.
 
     s: (N,) arclengths [m]; ring_nodes: (R + 1,) nodes of the base and of the rings; biases: number
     of IMUs;
@@ -45,11 +46,15 @@ class Grid:
         self.bias_offset = NODE_DIM * self.nodes
 
     def node_at(self, s: float) -> int:
-        """The node at arclength s [m]; every ring has one."""
+        """Return the node at arclength s [m]; every ring has one."""
         return int(np.argmin(np.abs(self.s - s)))
 
     def segments(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The nodes (m,) below arclengths s (m,) and the distances (m,) from them [m]; s is clipped to the body."""
+        """
+        Find the nodes (m,) below arclengths s (m,) and the distances (m,) from them [m].
+
+        s is clipped to the body.
+        """
         n = np.clip(np.searchsorted(self.s, s, side='right') - 1, 0, self.nodes - 2)
         return n, np.clip(s, self.s[0], self.s[-1]) - self.s[n]
 
@@ -61,7 +66,11 @@ class Grid:
 
 @dataclass(slots=True, eq=False)
 class Column:
-    """The body at one knot: time [s] since the epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3)."""
+    """
+    The body at one knot.
+
+    time [s] since the epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3).
+    """
 
     time: float
     T: np.ndarray
@@ -75,13 +84,17 @@ class Column:
         )
 
     def retract(self, delta: np.ndarray) -> Column:
-        """The column moved by a tangent vector (18 N + 3 I,)."""
+        """Move the column by a tangent vector (18 N + 3 I,)."""
         moved = self.copy()
         _retract(moved.T, moved.strain, moved.velocity, moved.bias, delta)
         return moved
 
     def minus(self, other: Column) -> np.ndarray:
-        """Tangent vector from `other` to this column: other.retract(self.minus(other)) is self."""
+        """
+        Tangent vector from `other` to this column, the inverse of `retract`.
+
+        `other.retract(self.minus(other))` is self.
+        """
         nodes = np.concatenate(
             [
                 lie.log(lie.inverse(other.T) @ self.T),
@@ -93,7 +106,7 @@ class Column:
         return np.concatenate([nodes.ravel(), (self.bias - other.bias).ravel()])
 
     def predict(self, dt: float) -> Column:
-        """The column dt later at constant body-frame velocity: the prior's mean."""
+        """Predict the column dt later at constant body-frame velocity: the prior's mean."""
         return Column(
             self.time + dt,
             self.T @ lie.exp(dt * self.velocity),
@@ -120,7 +133,11 @@ def _retract(T, strain, velocity, bias, delta):
 
 
 def shape_from_strain(T_map_base: np.ndarray, s: np.ndarray, strain: np.ndarray) -> np.ndarray:
-    """Poses (N, 4, 4) at s (N,) by integrating strain (N, 6) from the base: dT/ds = T eps^, midpoint rule."""
+    """
+    Poses (N, 4, 4) at s (N,) by integrating strain (N, 6) from the base.
+
+    dT/ds = T eps^, midpoint rule.
+    """
     T = np.empty((len(s), 4, 4))
     T[0] = T_map_base
     steps = lie.exp(0.5 * (strain[1:] + strain[:-1]) * np.diff(s)[:, None])
@@ -130,7 +147,7 @@ def shape_from_strain(T_map_base: np.ndarray, s: np.ndarray, strain: np.ndarray)
 
 
 def column_at_rest(grid: Grid, T_map_base: np.ndarray, strain: np.ndarray, time: float) -> Column:
-    """A motionless column with the given strain (N, 6)."""
+    """Make a motionless column with the given strain (N, 6)."""
     return Column(
         time,
         shape_from_strain(T_map_base, grid.s, strain),

@@ -1,6 +1,7 @@
 """
-The window: a chain of columns (the body at knot times) coupled by intervals (priors and
-measurements between two).
+The window: a chain of columns coupled by intervals.
+
+A column is the body at a knot time; an interval holds the priors and measurements between two.
 
 Each column has a linearisation point and an offset from it; a solve gives all offsets at once. A
 column that moved far is linearised anew, together with the intervals that touch it; the others
@@ -33,8 +34,9 @@ COST_SLACK = (
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
     """
-    How the window's measurements fit: squared normalised residuals, their number, and the share of
-    fitting samples by sensor.
+    How the window's measurements fit.
+
+    Squared normalised residuals, their number, and the share of fitting samples by sensor.
     """
 
     squared: float
@@ -63,11 +65,11 @@ class Window:
         self.forget_past(moving=False)
 
     def column(self, k: int) -> Column:
-        """The estimate of column k: its linearisation point moved by its offset."""
+        """Estimate column k: its linearisation point moved by its offset."""
         return self.columns[k].retract(self.offsets[k])
 
     def interval_at(self, time: float) -> Interval:
-        """The interval (t_k, t_k+1] that holds `time`, with new knots appended as needed."""
+        """Return the interval (t_k, t_k+1] that holds `time`; new knots are appended as needed."""
         while time > self.columns[-1].time + TIME_EPSILON or not self.intervals:
             self._append()
         k = int(np.ceil((time - self.columns[0].time) / self.settings.knot_period - 1e-6)) - 1
@@ -91,7 +93,11 @@ class Window:
         self.pinned = True
 
     def forget_past(self, moving: bool) -> None:
-        """Let the oldest column start from the prior alone; `moving` says that the body may be in motion there."""
+        """
+        Let the oldest column start from the prior alone.
+
+        `moving` says that the body may be in motion there.
+        """
         self._moving, self.pinned = moving, False
         self.chain = Chain(self.grid.dim, self._start_message())
         self.mark_changed()
@@ -268,18 +274,18 @@ class Window:
         )
 
     def newest_fits(self, factor_name: str) -> dict[str, np.ndarray]:
-        """[usable, fitting] samples by sensor, in the newest interval that has any of this factor."""
+        """[usable, fitting] samples by sensor, in the newest interval that has this factor."""
         for interval in reversed(self.intervals):
             if factor_name in interval.reports:
                 return interval.reports[factor_name].fits
         return {}
 
     def newest_rows(self, factor: Factor, count: int) -> list[tuple]:
-        """The rows of a factor in the newest `count` intervals, in order of arrival."""
+        """Rows of a factor in the newest `count` intervals, in order of arrival."""
         return [row for interval in self.intervals[-count:] for row in interval.rows(factor)]
 
     def knot_before(self, time: float) -> int:
-        """The interval that holds `time`, clipped to the window."""
+        """Return the interval that holds `time`, clipped to the window."""
         k = int(np.searchsorted([column.time for column in self.columns], time - TIME_EPSILON)) - 1
         return min(max(k, 0), len(self.intervals) - 1)
 

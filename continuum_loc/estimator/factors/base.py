@@ -1,6 +1,7 @@
 """
-The contract that every sensor's factor keeps; a new sensor is one file beside this one and an
-entry in FACTORS.
+Contract that every sensor's factor keeps.
+
+A new sensor is one file beside this one and an entry in FACTORS.
 
 A factor turns a measurement into a *row* when it arrives (a tuple of floats and arrays, in the
 body frame of its node), stacks the rows of an interval into arrays once, and adds their normal
@@ -31,8 +32,10 @@ class MeasurementError(ValueError):
 @dataclass(slots=True)
 class FactorReport:
     """
-    How an interval's measurements of one kind fit: robust cost, sum of squared normalised
-    residuals and their number, and for each sensor its [usable, fitting] counts.
+    How an interval's measurements of one kind fit.
+
+    Robust cost, sum of squared normalised residuals and their number, and for each sensor its
+    [usable, fitting] counts.
     """
 
     cost: float = 0.0
@@ -53,7 +56,7 @@ class Factor(ABC):
     @abstractmethod
     def row(self, measurement: Any) -> tuple:
         """
-        The measurement in the body frame of its node.
+        Return the measurement in the body frame of its node.
 
         Raises MeasurementError where it cannot be used.
         """
@@ -68,7 +71,11 @@ class Factor(ABC):
 
 
 class Repeats:
-    """Tells a frozen sensor: one whose samples are the same to the last bit more than `most` times in a row."""
+    """
+    Tells a frozen sensor.
+
+    Frozen: its samples are the same to the last bit more than `most` times in a row.
+    """
 
     def __init__(self, most: int):
         self._most = most
@@ -94,7 +101,7 @@ def require_finite(values: np.ndarray, what: str, sensor: str) -> None:
 
 
 def known_sensor(sensors: dict[str, Any], name: str, kind: str) -> Any:
-    """The entry of `name`, or MeasurementError listing the valid names."""
+    """Return the entry of `name`, or raise MeasurementError listing the valid names."""
     try:
         return sensors[name]
     except KeyError:

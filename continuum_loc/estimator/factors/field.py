@@ -1,4 +1,8 @@
-"""Hall sensor: the field of the magnet at the base (and Earth's), in the body frame; see `shape/observations.py`."""
+"""
+Hall sensor: the field of the magnet at the base (and Earth's), in the body frame.
+
+See `shape/observations.py`.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,11 @@ import numpy as np
 
 
 class FieldFactor(Factor):
-    """Three-axis field at a node, with noise of the sensor and a share of the field for what the model lacks."""
+    """
+    Three-axis field at a node.
+
+    Its noise is the sensor's, and a share of the field for what the model lacks.
+    """
 
     name = 'field'
     consumes = FieldSample

@@ -1,4 +1,4 @@
-"""Gyro: omega_measured = R_body_imu^T (varpi_angular + bias) + noise, the bias in the body frame."""
+"""Gyro: omega_measured = R_body_imu^T (varpi_angular + bias) + noise, bias in the body frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from continuum_loc.measurements import ImuSample
 from numba import njit
 import numpy as np
 
-FIT_SQUARED = 16.0  # an IMU fits while its mean residual is below four sigmas of one sample; rattling averages out
+# An IMU fits while its mean residual is below four sigmas of one sample; rattling averages out.
+FIT_SQUARED = 16.0
 MOST_REPEATS = 20  # a real gyro at rest repeats a sample now and then, through its quantisation
 
 

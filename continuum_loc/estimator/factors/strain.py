@@ -23,7 +23,11 @@ import numpy as np
 
 
 class StrainFactor(Factor):
-    """Bending strain at any number of stations, interpolated in arclength at both knots and linearly in time."""
+    """
+    Bending strain at any number of stations.
+
+    It is interpolated in arclength at both knots and linearly in time.
+    """
 
     name = 'strain'
     consumes = StrainSample
@@ -63,7 +67,11 @@ class StrainFactor(Factor):
         )
 
     def stack(self, times, rows):
-        """Rows of one interval grouped by station, as the geometry of a station serves all its samples."""
+        """
+        Rows of one interval grouped by station.
+
+        The geometry of a station serves all its samples.
+        """
         s = np.concatenate([row[0] for row in rows])
         stations, station = rows[0][0], np.tile(np.arange(len(rows[0][0])), len(rows))
         if len(s) != len(station) or not np.array_equal(

@@ -1,6 +1,7 @@
 """
-ToF: point-to-plane against the prior map (paper eqs. 1-4), associated anew whenever its interval
-is linearised.
+ToF: point-to-plane against the prior map (paper eqs. 1-4).
+
+Associated anew whenever its interval is linearised.
 
 All zones of one frame share (s, t), so their residuals gather in one 6x6 information block in the
 body frame, which is chained once through the interpolation. With b = R^T n the row of a zone is
@@ -33,7 +34,11 @@ HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
 
 
 class TofFactor(Factor):
-    """Zones of a ToF frame against the map's surface; `index` is the map's lookup, None switches the factor off."""
+    """
+    Zones of a ToF frame against the map's surface.
+
+    `index` is the map's lookup, None switches the factor off.
+    """
 
     name = 'tof'
     consumes = TofFrame
@@ -67,7 +72,7 @@ class TofFactor(Factor):
 
     @property
     def map_arrays(self) -> tuple:
-        """What the kernels need of the map: lookup, points, normals, weights, variance."""
+        """Return what the kernels need of the map: lookup, points, normals, weights, variance."""
         return self._index.arrays, self._cloud, self._normals, self._planarity, self._map_variance
 
     def row(self, measurement: TofFrame) -> tuple:
@@ -103,7 +108,12 @@ class TofFactor(Factor):
         return number, node, q, rays, variance, Association(len(points))
 
     def stack(self, times, rows):
-        """The association of each row becomes a view into the stacked arrays, so that it outlives the next stacking."""
+        """
+        Stack the rows of one interval.
+
+        The association of each row becomes a view into the stacked arrays, so that it outlives the
+        next stacking.
+        """
         kept = [row[5] for row in rows]
         hits, poses = (
             np.array([one.hits for one in kept]),
@@ -151,8 +161,9 @@ class TofFactor(Factor):
 
 class Association:
     """
-    Map points that a frame's zones were matched to, and the pose at which; its last element holds
-    the gate, so that another gate associates anew.
+    Map points that a frame's zones were matched to, and the pose at which.
+
+    Its last element holds the gate, so that another gate associates anew.
     """
 
     __slots__ = ('T_map_body', 'hits')
@@ -175,7 +186,11 @@ def _beams(
     rays,
     variance,
 ):
-    """Zones in the ring's frame: q, rays (Z, 3), variance (Z,) infinite where unusable; the number of usable ones."""
+    """
+    Zones in the ring's frame, and the number of usable ones.
+
+    q, rays (Z, 3), variance (Z,), infinite where unusable.
+    """
     usable = 0
     for z in range(points.shape[0]):
         x, y, w = points[z, 0], points[z, 1], points[z, 2]
@@ -197,7 +212,7 @@ def _beams(
 
 @njit(cache=True)
 def _moved(T, before, reach):
-    """The farthest that a point within `reach` of the body moved between two poses, at most [m]."""
+    """Farthest that a point within `reach` of the body moved between two poses, at most [m]."""
     shift, turn = 0.0, 0.0
     for i in range(3):
         shift += (T[i, 3] - before[i, 3]) ** 2
@@ -281,7 +296,11 @@ def _add(
 
 @njit(cache=True)
 def associate(T, q, rays, variance, arrays, normals, gate, min_cosine, hits):
-    """Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body; -1 where there is none."""
+    """
+    Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body.
+
+    -1 where there is none.
+    """
     zones = q.shape[0]
     points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
     for z in range(zones):
@@ -317,8 +336,7 @@ def frame_information(
     fit,
 ):
     """
-    Normal equations H (6, 6), g (6,) of one frame at T_map_body, and [usable, fitting] zones in
-    `fit`.
+    Add up one frame's H (6, 6), g (6,) at T_map_body; [usable, fitting] zones go to `fit`.
 
     Returns the robust cost, the sum of weighted squared residuals and the number of matched zones.
     An unmatched zone costs what a residual at the gate would, so that losing matches never pays.
