@@ -260,11 +260,13 @@ def _compare_facing(prior, index, peer, query, batches, repeats) -> dict:
 if __name__ == '__main__':
     for row in run():
         print(
-            f'{row["name"]:24s} {row["ours_s"] * 1e9:7.0f} ns   {row["peer"]:28s} {row["peer_s"] * 1e9:8.0f} ns   '
-            f'{row["ratio"]:6.1f} x  ({row["spread"][0]:.1f} to {row["spread"][1]:.1f})'
+            f'{row["name"]:24s} {row["ours_s"] * 1e9:7.0f} ns   {row["peer"]:28s} '
+            f'{row["peer_s"] * 1e9:8.0f} ns   {row["ratio"]:6.1f} x  ({row["spread"][0]:.1f} to '
+            f'{row["spread"][1]:.1f})'
         )
     for row in scaling():
         print(
-            f'{row["points"]:9d} points: built in {row["build_s"]:.2f} s, {row["index_bytes"] / 1e6:.0f} MB, '
-            f'first visit {row["first_visit_s"] * 1e9:.0f} ns, again {row["lookup_s"] * 1e9:.0f} ns'
+            f'{row["points"]:9d} points: built in {row["build_s"]:.2f} s, '
+            f'{row["index_bytes"] / 1e6:.0f} MB, first visit {row["first_visit_s"] * 1e9:.0f} ns, '
+            f'again {row["lookup_s"] * 1e9:.0f} ns'
         )

@@ -231,6 +231,7 @@ def _seconds(action: Action) -> float:
 if __name__ == '__main__':
     for row in run():
         print(
-            f'{row["name"]:16s} {row["ours_s"] * 1e3:8.3f} ms   {row["peer"]:24s} {row["peer_s"] * 1e3:9.2f} ms   '
-            f'{row["ratio"]:7.1f} x  ({row["spread"][0]:.1f} to {row["spread"][1]:.1f})'
+            f'{row["name"]:16s} {row["ours_s"] * 1e3:8.3f} ms   {row["peer"]:24s} '
+            f'{row["peer_s"] * 1e3:9.2f} ms   {row["ratio"]:7.1f} x  ({row["spread"][0]:.1f} to '
+            f'{row["spread"][1]:.1f})'
         )

@@ -37,7 +37,8 @@ def run(quick: bool = False) -> list[dict]:
     size = estimator.grid.nodes, 1 + round(settings.window / settings.knot_period)
     if size != (NODES, KNOTS):
         raise ValueError(
-            f'the window has {size[0]} nodes and {size[1]} knots; the figures are for {NODES} and {KNOTS}'
+            f'the window has {size[0]} nodes and {size[1]} knots; '
+            f'the figures are for {NODES} and {KNOTS}'
         )
     estimates(recording, estimator, (7.0, 7.5))  # compiles, and fills the window
     *_, step_ms = estimates(recording, estimator, (7.5, 9.0 if quick else 18.0))

@@ -97,7 +97,8 @@ def demo(
     for claim in outcome.claims:
         if not claim.holds:  # a slow machine is no failure of the demo; two different replays are
             errors.print(
-                f'[yellow]missed:[/] {claim.name} {claim.value:.3g} {claim.unit} (bound {claim.bound})',
+                f'[yellow]missed:[/] {claim.name} {claim.value:.3g} {claim.unit} '
+                f'(bound {claim.bound})',
                 highlight=False,
             )
     if not outcome.identical:
@@ -303,8 +304,8 @@ def tune(
     best_tried = min(tried, key=lambda one: one.cost)
     for name, one in (('start', tried[0]), ('best', best_tried)):
         console.print(
-            f'{name:6}{100 * one.translation_rmse_m:.3f} cm  {one.rotation_rmse_deg:.3f} deg  NEES/dof '
-            f'{one.nees_per_dof:.2f}',
+            f'{name:6}{100 * one.translation_rmse_m:.3f} cm  {one.rotation_rmse_deg:.3f} deg  '
+            f'NEES/dof {one.nees_per_dof:.2f}',
             highlight=False,
         )
     console.print(f'written {out}')
@@ -515,8 +516,9 @@ def _describe_map(path: Path, prior: Any) -> None:
     low, high = prior.points.min(axis=0), prior.points.max(axis=0)
     box = ' x '.join(f'{a:.2f}..{b:.2f}' for a, b in zip(low, high, strict=True))
     console.print(
-        f'{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, mean planarity '
-        f'{prior.planarity.mean():.2f}, normals {"outward" if prior.oriented else "of either sign"}',
+        f'{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, '
+        f'mean planarity {prior.planarity.mean():.2f}, '
+        f'normals {"outward" if prior.oriented else "of either sign"}',
         highlight=False,
     )
 

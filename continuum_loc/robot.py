@@ -86,7 +86,8 @@ class Insertion(Settings):
 
     mode: Literal['fixed', 'measured', 'unknown'] = Field(
         'fixed',
-        description='fixed at 0; measured by the `insertion` joint state; or unknown within `range`',
+        description='fixed at 0; measured by the `insertion` joint state; '
+        'or unknown within `range`',
     )
     range: tuple[float, float] = Field((0.0, 0.0), description='least and greatest travel [m]')
     sigma: float = Field(0.0005, gt=0.0, description='standard deviation of the encoder [m]')
@@ -267,8 +268,8 @@ class RobotDescription(Settings):
                 sensor.mount.T_ring_sensor[0, 0] < 0.5
             ):
                 raise ValueError(
-                    f"ToF sensor '{sensor.name}' sits inside the body (radius {self.radius} m) and looks "
-                    'sideways: move it to the surface or beyond'
+                    f"ToF sensor '{sensor.name}' sits inside the body (radius {self.radius} m) "
+                    'and looks sideways: move it to the surface or beyond'
                 )
         return self
 

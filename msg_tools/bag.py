@@ -158,7 +158,8 @@ def open_bag(path: Path) -> Iterator[Any]:
 
     if not path.exists():
         raise BagError(
-            f'{path}: no such bag; give a bag folder (with metadata.yaml), or an .mcap or .db3 file'
+            f'{path}: no such bag; give a bag folder (with metadata.yaml), '
+            'or an .mcap or .db3 file'
         )
     try:
         reader = Reader(path)
@@ -167,9 +168,9 @@ def open_bag(path: Path) -> Iterator[Any]:
         Exception
     ) as error:  # damaged bytes come out of rosbags as all sorts of errors, MemoryError among them
         raise BagError(
-            f'{path}: not a rosbag2 bag that can be read ({error or type(error).__name__}). Valid: a folder '
-            'with metadata.yaml, or one .mcap or .db3 file, closed by its recorder; `mcap recover` mends '
-            'a file that was cut off'
+            f'{path}: not a rosbag2 bag that can be read ({error or type(error).__name__}). '
+            'Valid: a folder with metadata.yaml, or one .mcap or .db3 file, '
+            'closed by its recorder; `mcap recover` mends a file that was cut off'
         ) from None
     try:
         yield reader

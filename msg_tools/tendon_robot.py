@@ -159,7 +159,8 @@ def _sensor_at(
             return sensor
     places = ', '.join(f'{robot.sensor_arclength(sensor.name):g}' for sensor in sensors) or 'none'
     raise TrialError(
-        f"{file.path}: robot '{robot.name}' has no {kind} at s = {file.s:g} m; it has some at: {places}"
+        f"{file.path}: robot '{robot.name}' has no {kind} at s = {file.s:g} m; "
+        f'it has some at: {places}'
     )
 
 

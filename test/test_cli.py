@@ -40,8 +40,8 @@ def test_help_shows_commands_and_examples(tmp_path):
 
 def test_help_imports_nothing_heavy(tmp_path):
     code = (
-        "import sys, continuum_loc.cli; print([m for m in ('numpy', 'mujoco', 'open3d', 'rclpy', 'matplotlib', "
-        "'plotly', 'pandas', 'numba') if m in sys.modules])"
+        "import sys, continuum_loc.cli; print([m for m in ('numpy', 'mujoco', 'open3d', 'rclpy', "
+        "'matplotlib', 'plotly', 'pandas', 'numba') if m in sys.modules])"
     )
     done = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, cwd=tmp_path

@@ -136,8 +136,8 @@ def test_meshes_are_sampled(tmp_path, suffix):
 def test_pcd_clouds_are_read(tmp_path):
     rows = '\n'.join(f'{i} {j} 0' for i in range(5) for j in range(5))
     (tmp_path / 'c.pcd').write_text(
-        'VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 25\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n'
-        f'POINTS 25\nDATA ascii\n{rows}\n'
+        'VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 25\nHEIGHT 1\n'
+        f'VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 25\nDATA ascii\n{rows}\n'
     )
     prior = load_map(tmp_path / 'c.pcd', viewpoint=[0.0, 0.0, 5.0])
     assert len(prior) == 25 and np.allclose(prior.normals, [0, 0, 1])

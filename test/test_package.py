@@ -65,7 +65,8 @@ def test_the_core_imports_without_ros():
 def test_importing_the_package_is_light():
     code = (
         'import sys, continuum_loc, msg_tools, continuum_loc.robot, continuum_loc.measurements\n'
-        f'import continuum_loc.nodes.live\nprint([name for name in {ROS + HEAVY!r} if name in sys.modules])'
+        'import continuum_loc.nodes.live\n'
+        f'print([name for name in {ROS + HEAVY!r} if name in sys.modules])'
     )
     assert _python(code).stdout.strip() == '[]'
 

@@ -508,7 +508,8 @@ def test_unknown_trajectories_name_the_valid_ones():
 def test_a_trajectory_of_ones_own_is_read_from_yaml(tmp_path):
     path = tmp_path / 'lean.yaml'
     path.write_text(
-        'keyframes:\n  - {time: 1.0, tensions: [1, 1, 1, 1]}\n  - {time: 3.0, tensions: [1, 9, 1, 1]}\n'
+        'keyframes:\n  - {time: 1.0, tensions: [1, 1, 1, 1]}\n'
+        '  - {time: 3.0, tensions: [1, 9, 1, 1]}\n'
     )
     made = trajectory(str(path), load_robot('soft_arm'), load_plant('soft_arm'))
     assert made.name == 'lean' and made.duration == 3.0
@@ -525,7 +526,8 @@ def test_a_trajectory_of_ones_own_is_read_from_yaml(tmp_path):
     ):
         trajectory(str(path), load_robot('soft_arm'), load_plant('soft_arm'))
     path.write_text(
-        'keyframes:\n  - {time: 3.0, tensions: [1, 1, 1, 1]}\n  - {time: 2.0, tensions: [1, 1, 1, 1]}\n'
+        'keyframes:\n  - {time: 3.0, tensions: [1, 1, 1, 1]}\n'
+        '  - {time: 2.0, tensions: [1, 1, 1, 1]}\n'
     )
     with pytest.raises(SettingsError, match='lean.yaml: .*increasing times'):
         trajectory(str(path), load_robot('soft_arm'), load_plant('soft_arm'))

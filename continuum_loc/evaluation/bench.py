@@ -59,11 +59,13 @@ class BenchOutcome:
         """A line for each ratio that fell clearly below the committed one."""
         if not baseline.is_file():
             raise BenchError(
-                f'{baseline}: no baseline to compare with; write one by `continuum-loc bench --baseline`'
+                f'{baseline}: no baseline to compare with; '
+                'write one by `continuum-loc bench --baseline`'
             )
         known = {(row['name'], row['peer']): row for row in json.loads(baseline.read_text())}
         return [
-            f'{row["name"]} against {row["peer"]}: ratio {row["ratio"]:.2f}, baseline {old["ratio"]:.2f}'
+            f'{row["name"]} against {row["peer"]}: ratio {row["ratio"]:.2f}, '
+            f'baseline {old["ratio"]:.2f}'
             for row in self.rows
             if row.get('ratio') is not None
             and (old := known.get((row['name'], row['peer']))) is not None
@@ -83,7 +85,8 @@ def bench_names() -> list[str]:
     """
     if not BENCH_FOLDER.is_dir():
         raise BenchError(
-            f'{BENCH_FOLDER}: no benchmarks; they are in the source tree, not in the installed package'
+            f'{BENCH_FOLDER}: no benchmarks; they are in the source tree, '
+            'not in the installed package'
         )
     return sorted(path.stem for path in BENCH_FOLDER.glob('*.py') if not path.name.startswith('_'))
 

@@ -369,7 +369,8 @@ def _speed_parts(run: Run) -> Iterator[Part]:
     if len(steps):
         factor = run.summary['real_time_factor']
         note = (
-            f'{run.summary["data_seconds"]:.1f} s of data in {run.result.processing_seconds:.2f} s: '
+            f'{run.summary["data_seconds"]:.1f} s of data in '
+            f'{run.result.processing_seconds:.2f} s: '
             f'real-time factor {_number(factor, digits=1)} on one core.'
         )
         yield Part('Time per step', note, figure=chart(figures.time_histogram(steps, 'step [ms]')))

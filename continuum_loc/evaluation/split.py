@@ -24,8 +24,8 @@ def hold_out(robot: str) -> Trial:
     """The hold-out of a bundled robot. Raises SplitError for a robot that has none."""
     if robot not in HOLD_OUT:
         raise SplitError(
-            f"robot '{robot}' has no hold-out of its own; give a bag and a map. Robots that have one: "
-            f'{", ".join(HOLD_OUT)}'
+            f"robot '{robot}' has no hold-out of its own; give a bag and a map. "
+            f'Robots that have one: {", ".join(HOLD_OUT)}'
         )
     return HOLD_OUT[robot]
 

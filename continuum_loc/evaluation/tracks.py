@@ -87,8 +87,8 @@ class Track:
         odd = next((stamp for stamp in stamps if latest[stamp].shape != (len(names), 4, 4)), None)
         if odd is not None:
             raise TrackError(
-                f'the truth at {odd / NANOSECONDS:.3f} s holds {len(latest[odd])} poses; this robot has '
-                f'{len(names)}: {", ".join(names)}'
+                f'the truth at {odd / NANOSECONDS:.3f} s holds {len(latest[odd])} poses; '
+                f'this robot has {len(names)}: {", ".join(names)}'
             )
         return cls(
             np.array(stamps, np.int64), names, np.stack([latest[stamp] for stamp in stamps])

@@ -172,7 +172,8 @@ def _checked_mesh(vertices, faces, source):
         raise MapError(f'{source}: faces must be (F, 3) with F >= 1, got {faces.shape}')
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MapError(
-            f'{source}: faces name vertices {faces.min()} to {faces.max()}, there are {len(vertices)}'
+            f'{source}: faces name vertices {faces.min()} to {faces.max()}, '
+            f'there are {len(vertices)}'
         )
     return vertices, faces
 
@@ -184,8 +185,8 @@ def _finite(rows, name, source):
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
         raise MapError(
-            f'{source}: {len(bad)} of {len(rows)} {name} are not finite, the first is number {bad[0]} '
-            '(counted from 0); remove them or repair the file'
+            f'{source}: {len(bad)} of {len(rows)} {name} are not finite, '
+            f'the first is number {bad[0]} (counted from 0); remove them or repair the file'
         )
     return rows
 
@@ -195,7 +196,8 @@ def _unit(normals, source):
     bad = np.flatnonzero(length < 1e-9)
     if len(bad):
         raise MapError(
-            f'{source}: {len(bad)} of {len(normals)} normals have length 0, the first is number {bad[0]}'
+            f'{source}: {len(bad)} of {len(normals)} normals have length 0, '
+            f'the first is number {bad[0]}'
         )
     return normals / length[:, None]
 
@@ -239,7 +241,8 @@ def _poisson_subset(points, normals, spacing):
     cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64) + 1
     if cells.max() >= 1 << 20:
         raise MapError(
-            f'spacing {spacing} m is too small for a mesh {np.ptp(points, axis=0).max():.6g} m across'
+            f'spacing {spacing} m is too small for a mesh '
+            f'{np.ptp(points, axis=0).max():.6g} m across'
         )
     slots = np.full(1 << int(np.ceil(np.log2(2 * len(points)))), -1, np.int32)
     following = np.full(len(points), -1, np.int32)

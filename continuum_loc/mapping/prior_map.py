@@ -60,7 +60,8 @@ class PriorMap:
         )
         if not (self.sigma > 0.0 and self.spacing >= 0.0):
             raise MapError(
-                f'{self._name}: sigma must be > 0 and spacing >= 0, got {self.sigma}, {self.spacing}'
+                f'{self._name}: sigma must be > 0 and spacing >= 0, '
+                f'got {self.sigma}, {self.spacing}'
             )
 
     def __len__(self) -> int:
@@ -128,8 +129,8 @@ def _require_columns(prior: PriorMap) -> None:
     shapes = tuple(np.shape(getattr(prior, name)) for name in ('points', 'normals', 'planarity'))
     if count == 0 or shapes != ((count, 3), (count, 3), (count,)):
         raise MapError(
-            f'{prior._name}: expected points (P, 3), normals (P, 3) and planarity (P,) with P >= 1, '
-            f'got {shapes}'
+            f'{prior._name}: expected points (P, 3), normals (P, 3) and planarity (P,) '
+            f'with P >= 1, got {shapes}'
         )
 
 
@@ -137,7 +138,8 @@ def _refuse_rows(prior: PriorMap, bad: np.ndarray, rule: str) -> None:
     rows = np.flatnonzero(bad)
     if len(rows):
         raise MapError(
-            f'{prior._name}: {rule}; {len(rows)} of {len(bad)} rows do not comply, first row {rows[0]}'
+            f'{prior._name}: {rule}; '
+            f'{len(rows)} of {len(bad)} rows do not comply, first row {rows[0]}'
         )
 
 

@@ -218,20 +218,22 @@ def _stacked(
     inside = [frame for frame in frames if first <= frame.stamp <= last]
     if not inside:
         raise MapError(
-            f"none of the {len(frames)} ToF frames lies within the trajectory's time, {first} to {last} ns"
+            f"none of the {len(frames)} ToF frames lies within the trajectory's "
+            f'time, {first} to {last} ns'
         )
     names = [sensor.name for sensor in robot.tof]
     strange = sorted({frame.sensor for frame in inside} - set(names))
     if strange:
         raise MapError(
-            f"frames of {', '.join(strange)}; robot '{robot.name}' has the ToF sensors {', '.join(names)}"
+            f'frames of {", ".join(strange)}; '
+            f"robot '{robot.name}' has the ToF sensors {', '.join(names)}"
         )
     zones = len(robot.tof_model.directions)
     for frame in inside:
         if frame.points.shape != (zones, 3) or frame.ranges.shape != (zones,):
             raise MapError(
-                f"a frame of {frame.sensor} has points {frame.points.shape}, the robot's ToF model {zones} "
-                'zones'
+                f'a frame of {frame.sensor} has points {frame.points.shape}, '
+                f"the robot's ToF model {zones} zones"
             )
     ranges, sigma, status = (
         np.stack([getattr(frame, name) for frame in inside])

@@ -763,8 +763,8 @@ def _build(points: np.ndarray, voxel: float, reach: float, cache_cells: int) -> 
     extent = np.floor((points.max(axis=0) - origin) * inverse).astype(np.int64)
     if extent.max() >= AXIS_LIMIT:
         raise MapError(
-            f'voxel {voxel} m is too small for a cloud {np.ptp(points, axis=0).max():.6g} m across; '
-            f'at most {AXIS_LIMIT} voxels fit along an axis'
+            f'voxel {voxel} m is too small for a cloud {np.ptp(points, axis=0).max():.6g} m '
+            f'across; at most {AXIS_LIMIT} voxels fit along an axis'
         )
     codes = _morton_codes(points, origin, inverse)
     order = np.argsort(codes, kind='stable')

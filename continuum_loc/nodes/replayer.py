@@ -75,7 +75,8 @@ class ReplayerNode(PackageNode):
         ]
         if not topics:
             raise BagError(
-                f'{self.path}: none of {", ".join(chosen)} is in it; it holds {", ".join(sorted(present))}'
+                f'{self.path}: none of {", ".join(chosen)} is in it; '
+                f'it holds {", ".join(sorted(present))}'
             )
         return sorted(topics)
 

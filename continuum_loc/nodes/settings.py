@@ -22,7 +22,8 @@ class IntakeSettings(Settings):
 
     reliable_inputs: bool = Field(
         False,
-        description='ask publishers to resend lost messages; best-effort publishers are then not heard',
+        description='ask publishers to resend lost messages; '
+        'best-effort publishers are then not heard',
     )
     max_backlog: float = _live(
         0.25, gt=0.0, description='queued ToF frames older than this are dropped, oldest first [s]'
@@ -165,7 +166,8 @@ class RecorderNodeSettings(Settings):
     )
     reliable_inputs: bool = Field(
         False,
-        description='ask publishers to resend lost messages; best-effort publishers are then not heard',
+        description='ask publishers to resend lost messages; '
+        'best-effort publishers are then not heard',
     )
     summary_file: str = Field(
         '', description='JSON file of message counts, written at the end; empty for none'

@@ -134,8 +134,9 @@ class SimulatorNode(PackageNode):
                 return False
             if time.monotonic() > deadline:
                 raise TimeoutError(
-                    f'{sensors.get_subscription_count()} of {self.settings.wait_for} subscriptions '
-                    f'listen to {sensors.topic_name} after {self.settings.wait_timeout:g} s'
+                    f'{sensors.get_subscription_count()} of {self.settings.wait_for} '
+                    f'subscriptions listen to {sensors.topic_name} after '
+                    f'{self.settings.wait_timeout:g} s'
                 )
             time.sleep(0.02)
         if self.settings.wait_for:

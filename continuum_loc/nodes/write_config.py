@@ -43,10 +43,11 @@ FILTER_NOTE = """\
 def config_text(node: str) -> str:
     """The commented YAML of a node's parameters at their defaults."""
     head = (
-        f'# Parameters of node `{node}` at their defaults, by `python -m continuum_loc.nodes.write_config`.\n'
+        f'# Parameters of node `{node}` at their defaults, '
+        'by `python -m continuum_loc.nodes.write_config`.\n'
         f'#   ros2 run continuum_loc {node} --ros-args --params-file {node}.yaml -p name:=value\n'
-        '# [live] may change while the node runs (`ros2 param set`); the others are refused then.\n'
-        '/**:\n  ros__parameters:\n'
+        '# [live] may change while the node runs (`ros2 param set`); '
+        'the others are refused then.\n/**:\n  ros__parameters:\n'
     )
     return head + ''.join(_entries(NODES[node])) + (FILTER_NOTE if node == 'estimator' else '')
 

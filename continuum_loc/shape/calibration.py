@@ -122,8 +122,8 @@ def module_mounts(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
         or [h.ring for h in robot.hall] != [i.ring for i in robot.imu]
     ):
         raise SettingsError(
-            f"robot '{robot.name}' cannot sense its shape: it needs a magnet, and an IMU beside each "
-            f'Hall sensor; Hall sensors on {[sensor.ring for sensor in robot.hall]}, '
+            f"robot '{robot.name}' cannot sense its shape: it needs a magnet, and an IMU beside "
+            f'each Hall sensor; Hall sensors on {[sensor.ring for sensor in robot.hall]}, '
             f'IMUs on {[sensor.ring for sensor in robot.imu]}'
         )
     return (

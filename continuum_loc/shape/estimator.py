@@ -52,8 +52,8 @@ class ShapeSettings(Settings):
     rate: float = Field(25.0, gt=0.0, description='estimates per second of data time [Hz]')
     start: Literal['straight', 'anyhow'] = Field(
         'straight',
-        description='shape during taring: straight also tares mounts and checks the wiring; anyhow '
-        "only averages the gyro bias, and yaw then starts from the base's",
+        description='shape during taring: straight also tares mounts and checks the wiring; '
+        "anyhow only averages the gyro bias, and yaw then starts from the base's",
     )
     taring_seconds: float = Field(1.0, gt=0.0, description='rest at the start [s]')
     calibration: Path | None = Field(
@@ -260,7 +260,8 @@ class ShapeEstimator:
             )
             if not np.isfinite(reading).all():
                 raise ValueError(
-                    f"IMU sample of '{sample.sensor}' at {sample.stamp} is not finite: {reading.tolist()}"
+                    f"IMU sample of '{sample.sensor}' at {sample.stamp} is not "
+                    f'finite: {reading.tolist()}'
                 )
         else:
             reading, stream, full = np.asarray(sample.field, float), module.hall, 1

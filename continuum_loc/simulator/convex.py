@@ -43,15 +43,15 @@ def convex_pieces(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[
                     return tuple(pieces[name] for name in pieces.files)
             if mode != _MODES[-1]:
                 _log.warning(
-                    '%s: convex decomposition failed, trying again with a remeshed surface: contact will be '
-                    'coarse, to about %.0f mm',
+                    '%s: convex decomposition failed, trying again with a remeshed surface: '
+                    'contact will be coarse, to about %.0f mm',
                     where,
                     1e3 * np.ptp(vertices, axis=0).max() / _REMESHING,
                 )
     last_words = (run.stderr.strip().splitlines() or [f'status {run.returncode}'])[-1]
     raise SceneError(
-        f'{where}: cannot be split into convex pieces for contact (CoACD: {last_words}); simplify the '
-        'mesh, or thicken its thinnest walls'
+        f'{where}: cannot be split into convex pieces for contact (CoACD: {last_words}); '
+        'simplify the mesh, or thicken its thinnest walls'
     )
 
 

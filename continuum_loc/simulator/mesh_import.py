@@ -66,8 +66,8 @@ def _check_size(vertices: np.ndarray, where: str) -> None:
         else ''
     )
     raise SceneError(
-        f'{where}: measures {" x ".join(f"{edge:.4g}" for edge in extent)} m{hint}. The longest edge must '
-        f'lie between {_SMALLEST} and {_LARGEST} m'
+        f'{where}: measures {" x ".join(f"{edge:.4g}" for edge in extent)} m{hint}. '
+        f'The longest edge must lie between {_SMALLEST} and {_LARGEST} m'
     )
 
 
@@ -78,8 +78,8 @@ def _check_degenerate(vertices: np.ndarray, faces: np.ndarray, where: str) -> No
     if flat.any():
         first = int(np.flatnonzero(flat)[0])
         raise SceneError(
-            f'{where}: {int(flat.sum())} degenerate faces without area, the first is face {first} at '
-            f'{_place(a[first])}; remove them (MeshLab: Remove Zero Area Faces)'
+            f'{where}: {int(flat.sum())} degenerate faces without area, the first is face {first} '
+            f'at {_place(a[first])}; remove them (MeshLab: Remove Zero Area Faces)'
         )
 
 
@@ -94,8 +94,8 @@ def _check_closed(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     if (count == 1).any():
         middle = vertices[edges[count == 1]].mean(axis=(0, 1))
         raise SceneError(
-            f'{where}: {int((count == 1).sum())} open edges, holes near {_place(middle)}; close them '
-            '(MeshLab: Close Holes; Blender: Mesh > Clean Up > Fill Holes)'
+            f'{where}: {int((count == 1).sum())} open edges, holes near {_place(middle)}; '
+            'close them (MeshLab: Close Holes; Blender: Mesh > Clean Up > Fill Holes)'
         )
     if (count > 2).any():
         place = vertices[edges[count > 2][0]].mean(axis=0)
@@ -108,8 +108,8 @@ def _check_closed(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     )
     if np.any(forward != 0.0):
         raise SceneError(
-            f'{where}: {int((forward != 0.0).sum())} edges between faces that look opposite ways; make '
-            'the orientation consistent (MeshLab: Re-Orient All Faces Coherently)'
+            f'{where}: {int((forward != 0.0).sum())} edges between faces that look opposite ways; '
+            'make the orientation consistent (MeshLab: Re-Orient All Faces Coherently)'
         )
 
 

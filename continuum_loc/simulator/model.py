@@ -103,8 +103,9 @@ def advance(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     worst = int(np.argmax(np.where(np.isfinite(data.qacc), speed, np.inf)))
     joint = model.joint(int(model.dof_jntid[worst])).name
     raise SimulationDiverged(
-        f"the simulation diverged at {data.time:.4f} s in joint '{joint}' ({speed[worst]:.3g} rad/s or m/s): shorten "
-        f'`time_step` (now {model.opt.timestep} s) or raise `relaxation` in the plant, or lower the forces there'
+        f"the simulation diverged at {data.time:.4f} s in joint '{joint}' "
+        f'({speed[worst]:.3g} rad/s or m/s): shorten `time_step` (now {model.opt.timestep} s) '
+        'or raise `relaxation` in the plant, or lower the forces there'
     )
 
 
@@ -121,8 +122,9 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_
         while quiet < QUIET_STEPS:
             if data.time > SETTLE_LIMIT:
                 raise SimulationDiverged(
-                    f'the robot did not come to rest within {SETTLE_LIMIT} s under its first tensions: raise '
-                    '`relaxation` in the plant, or begin the trajectory without contact'
+                    f'the robot did not come to rest within {SETTLE_LIMIT} s under its first '
+                    'tensions: raise `relaxation` in the plant, '
+                    'or begin the trajectory without contact'
                 )
             advance(model, data)
             quiet = quiet + 1 if np.abs(data.cvel).max() < rest_speed else 0

@@ -72,7 +72,8 @@ class PlantSettings(Settings):
     def _isotropic(self) -> PlantSettings:
         if not np.isclose(self.EI, self.GJ, rtol=1e-9):
             raise ValueError(
-                f'GJ = {self.GJ} must equal EI = {self.EI}: a ball joint has one stiffness for all axes'
+                f'GJ = {self.GJ} must equal EI = {self.EI}: '
+                'a ball joint has one stiffness for all axes'
             )
         return self
 

@@ -318,8 +318,8 @@ def _resolve(path: str | Trajectory, robot: RobotDescription, plant: PlantSettin
     least, most = robot.base.insertion.range
     if path.insertion.min() < least - 1e-9 or path.insertion.max() > most + 1e-9:
         raise SettingsError(
-            f"trajectory '{path.name}' inserts {path.insertion.min()} to {path.insertion.max()} m; "
-            f"robot '{robot.name}' can travel {least} to {most} m"
+            f"trajectory '{path.name}' inserts {path.insertion.min()} to "
+            f"{path.insertion.max()} m; robot '{robot.name}' can travel {least} to {most} m"
         )
     return path
 

@@ -286,8 +286,8 @@ def drift(warm: Sequence[CaseResult]) -> str:
         for name in ('without ToF', 'all sensors')
     )
     return (
-        f'without ToF it goes from {without[0]:.2f} cm at the first ring to {without[-1]:.2f} cm at the tip, with '
-        f'all sensors from {everything[0]:.2f} cm to {everything[-1]:.2f} cm'
+        f'without ToF it goes from {without[0]:.2f} cm at the first ring to {without[-1]:.2f} cm '
+        f'at the tip, with all sensors from {everything[0]:.2f} cm to {everything[-1]:.2f} cm'
     )
 
 
@@ -298,7 +298,8 @@ def minima(cold: Sequence[CaseResult]) -> str:
         stuck = sum(found_after(result) == np.inf for result in members)
         worst = 100.0 * max(float(result.worst_ring[-1]) for result in members)
         told.append(
-            f'`{name}` ends in a wrong body in {stuck} of {len(members)} starts (the worst by {worst:.1f} cm), '
-            f'off unannounced for up to {max(longest_unannounced(result) for result in members):.2f} s'
+            f'`{name}` ends in a wrong body in {stuck} of {len(members)} starts (the worst by '
+            f'{worst:.1f} cm), off unannounced for up to '
+            f'{max(longest_unannounced(result) for result in members):.2f} s'
         )
     return '; '.join(told) or 'no figures, as the trials failed'

@@ -98,14 +98,15 @@ def data_folder() -> Path:
     named = os.environ.get(DATA)
     if not named:
         raise StudyError(
-            f'the recorded trials are not part of the package: set {DATA} to the folder that holds '
-            f'{" and ".join(WINDOWS)}'
+            'the recorded trials are not part of the package: '
+            f'set {DATA} to the folder that holds {" and ".join(WINDOWS)}'
         )
     for folder in (Path(named), Path(named) / ROBOT):
         if all((folder / trial).is_dir() for trial in WINDOWS):
             return folder
     raise StudyError(
-        f'{DATA} is {named}, which does not hold {" and ".join(WINDOWS)}, nor does {Path(named) / ROBOT}'
+        f'{DATA} is {named}, which does not hold {" and ".join(WINDOWS)}, '
+        f'nor does {Path(named) / ROBOT}'
     )
 
 
