@@ -1,1 +1,5 @@
-"""Prior maps, their nearest-neighbour index, and what the sensors saw: reconstruction and anomalies."""
+"""
+Prior maps, their nearest-neighbour index, and what the sensors saw.
+
+The last: reconstruction and anomalies.
+"""

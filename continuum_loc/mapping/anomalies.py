@@ -1,6 +1,7 @@
 """
-What differs between the prior map and what was measured: new things, and missing ones (paper,
-VI-C.4, eq. 12).
+What differs between the prior map and what was measured (paper, VI-C.4, eq. 12).
+
+New things, and missing ones.
 
 A *new* point is one whose squared Mahalanobis distance to the nearest map point exceeds tau. A map
 point stands for
@@ -100,7 +101,11 @@ class AnomalyCluster:
 
 
 class Evidence(NamedTuple):
-    """Places (N, 3) [m], whether the beam there disagrees with the map (N,), and its stamp (N,) ns."""
+    """
+    What the measurements say of some places, for or against the map.
+
+    Places (N, 3) [m], whether the beam there disagrees with the map (N,), and its stamp (N,) ns.
+    """
 
     places: np.ndarray
     disagrees: np.ndarray
@@ -136,7 +141,7 @@ def new_evidence(
     through: np.ndarray | None = None,
 ) -> Evidence:
     """
-    Every measured point: does it lie off the map (eq. 12)?
+    Judge every measured point by whether it lies off the map (eq. 12).
 
     Not of a beam that went `through` (N,) the map: what a missing thing has laid open is no new
     thing.
@@ -151,7 +156,7 @@ def new_evidence(
 def mahalanobis2(
     reconstruction: Reconstruction, prior: PriorMap, search_radius: float, index: VoxelIndex
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) left side of eq. 12 and (N,) distance [m] to the nearest map point; inf where there is none."""
+    """(N,) left side of eq. 12 and (N,) distance [m] to the nearest map point; inf where none."""
     row, distance = index.nearest(reconstruction.points, search_radius)
     distance2 = np.full(len(row), np.inf)
     found = np.flatnonzero(row >= 0)
@@ -167,7 +172,11 @@ def mahalanobis2(
 
 
 def tangential_variance(prior: PriorMap) -> float:
-    """Variance [m^2], along each tangent, of a surface point about the nearest of blue-noise samples."""
+    """
+    Variance [m^2] of a surface point about the nearest of blue-noise samples.
+
+    It holds along each tangent.
+    """
     return prior.spacing**2 / DENSITY / (4.0 * np.pi)
 
 
@@ -175,8 +184,10 @@ def missing_evidence(
     reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings, index: VoxelIndex
 ) -> tuple[Evidence, np.ndarray]:
     """
-    Every mapped surface that a beam should have met first: did the beam go through it, or end on
-    it? And for each measured point (N,), whether its beam did go through.
+    Judge every mapped surface that a beam should have met first.
+
+    Did the beam go through it, or end on it? And for each measured point (N,), whether its beam
+    did go through.
 
     A beam that ends in front of the mapped surface says nothing about it. One without a return
     went its whole length.
@@ -220,7 +231,7 @@ def clusters(evidence: Evidence, kind: Kind, settings: AnomalySettings) -> list[
 
 
 def _linked(centres: np.ndarray, link: float) -> np.ndarray:
-    """(N,) number of the connected component of each place, where those closer than `link` are joined."""
+    """(N,) number of the connected component of each place; nearer than `link` is joined."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -259,7 +270,11 @@ def wilson_lower_bound(successes: int, trials: int, z: float) -> float:
 
 
 class Truth(NamedTuple):
-    """A known anomaly: its kind and the closed mesh (V, 3), (F, 3) of what was added or taken away."""
+    """
+    A known anomaly: its kind and the closed mesh of what was added or taken away.
+
+    Vertices (V, 3), faces (F, 3).
+    """
 
     kind: Kind
     vertices: np.ndarray
@@ -274,9 +289,10 @@ class Truth(NamedTuple):
 @dataclass(frozen=True)
 class PrecisionRecall:
     """
-    One row per confidence threshold: clusters kept, how many of them are real, real anomalies
-    found, and both as shares (precision is 1 where nothing is kept, recall 1 where there was
-    nothing to find).
+    One row per confidence threshold.
+
+    Clusters kept, how many of them are real, real anomalies found, and both as shares (precision
+    is 1 where nothing is kept, recall 1 where there was nothing to find).
     """
 
     threshold: np.ndarray
@@ -339,8 +355,9 @@ def seen(
     truth: Sequence[Truth], reconstruction: Reconstruction, least_beams: int = 10
 ) -> list[Truth]:
     """
-    Those of the true anomalies that at least so many beams ended on (added) or went through
-    (missing).
+    Those of the true anomalies that enough beams met.
+
+    Met: ended on (added) or went through (missing).
 
     Needs a reconstruction from the true poses: it says what could have been detected.
     """

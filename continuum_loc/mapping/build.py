@@ -30,8 +30,9 @@ def sample_mesh(
     source: str = 'mesh',
 ) -> PriorMap:
     """
-    Blue-noise points on a triangle mesh with the triangles' normals (outward by the right-hand
-    rule).
+    Blue-noise points on a triangle mesh with the triangles' normals.
+
+    Normals point outward by the right-hand rule.
 
     vertices: (V, 3) [m]; faces: (F, 3). No two points on the same side of the surface are closer
     than `spacing` [m]; or give `count`, about as many points as wanted. The two sides of a thin
@@ -74,8 +75,9 @@ def map_from_cloud(
     source: str = 'cloud',
 ) -> PriorMap:
     """
-    A map from a measured cloud (P, 3) [m]; what is missing of normals (P, 3) and planarity (P,)
-    comes from PCA.
+    Make a map from a measured cloud (P, 3) [m].
+
+    What is missing of normals (P, 3) and planarity (P,) comes from PCA.
 
     PCA normals are turned toward `viewpoint` (3,) [m]; without one their sign means nothing and
     the map says so.
@@ -100,7 +102,7 @@ def map_from_cloud(
 
 
 def _turned(normals, points, viewpoint):
-    """Normals turned toward a viewpoint, where there is one."""
+    """Turn normals toward a viewpoint, where there is one."""
     if viewpoint is None:
         return normals
     toward = np.einsum('ij,ij->i', normals, np.asarray(viewpoint, dtype=np.float64) - points)
@@ -237,7 +239,11 @@ def _uniform_on_triangles(corners, areas, count, generator):
 
 
 def _poisson_subset(points, normals, spacing):
-    """Rows of a subset in which no two points of the same side are closer than `spacing`, earlier rows first."""
+    """
+    Rows of a subset in which no two points of the same side are closer than `spacing`.
+
+    Earlier rows go first.
+    """
     cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64) + 1
     if cells.max() >= 1 << 20:
         raise MapError(

@@ -1,4 +1,8 @@
-"""Point clouds with any per-point fields as binary PLY (readable by Open3D, CloudCompare, MeshLab)."""
+"""
+Point clouds with any per-point fields as binary PLY.
+
+Open3D, CloudCompare and MeshLab read it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,11 @@ _TYPES = {'f8': 'double', 'f4': 'float', 'i4': 'int', 'u1': 'uchar'}
 
 
 def write_ply(path: str | Path, fields: dict[str, np.ndarray]) -> None:
-    """Write one vertex per row of the equally long 1-D `fields` (float64, float32, int32 or uint8), in their order."""
+    """
+    Write one vertex per row of the equally long 1-D `fields`, in their order.
+
+    Valid are float64, float32, int32 and uint8.
+    """
     kinds = {name: np.asarray(values).dtype.str[1:] for name, values in fields.items()}
     table = np.empty(
         len(next(iter(fields.values()))),

@@ -72,11 +72,15 @@ class PriorMap:
         return self.source or 'prior map'
 
     def index(self, reach: float = 0.1) -> VoxelIndex:
-        """A new nearest-neighbour index of the map; rows it returns are rows of this map."""
+        """Make a new nearest-neighbour index of the map; rows it returns are rows of this map."""
         return VoxelIndex(self.points, self.normals, reach=reach)
 
     def save(self, path: str | Path) -> None:
-        """Write `.npz` (everything, fast), `.ply`, `.csv` or `.xyz` (points, normals and planarity)."""
+        """
+        Write `.npz` (everything, fast), or `.ply`, `.csv`, `.xyz`.
+
+        The latter hold points, normals and planarity.
+        """
         path = Path(path)
         writer = _chosen(path, _WRITERS, 'written')
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,8 +101,9 @@ def load_map(
     seed: int = 0,
 ) -> PriorMap:
     """
-    A prior map from a file: `.npz`, `.ply`, `.pcd`, `.xyz`, `.csv`, or a mesh (`.stl`, `.obj`,
-    `.ply` with faces).
+    Load a prior map from a file.
+
+    `.npz`, `.ply`, `.pcd`, `.xyz`, `.csv`, or a mesh (`.stl`, `.obj`, `.ply` with faces).
 
     sigma: standard deviation of a point [m], where the file states none (default 0.1 mm, the
     paper's scanner).
@@ -211,7 +216,11 @@ def _valid_columns() -> str:
 
 
 def _check_csv_header(path: Path) -> int:
-    """Number of header lines (0 or 1). A header must name the columns in order."""
+    """
+    Count header lines (0 or 1).
+
+    A header must name the columns in order.
+    """
     with path.open(errors='replace') as stream:
         names = [name.strip().lower() for name in stream.readline().split(',')]
     if tuple(names) in {CLOUD_COLUMNS[:count] for count in COLUMN_COUNTS}:

@@ -1,4 +1,8 @@
-"""The scene as the sensors saw it: every ToF zone projected into the map with its covariance (paper, eqs. 10-11)."""
+"""
+The scene as the sensors saw it (paper, eqs. 10-11).
+
+Every ToF zone is projected into the map with its covariance.
+"""
 
 from __future__ import annotations
 
@@ -57,9 +61,10 @@ class RingTrajectory:
 
     def at(self, stamps: np.ndarray, rings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        T_map_ring (M, 4, 4) and covariance (M, 6, 6) of ring number `rings` (M,) at `stamps` (M,)
-        within the
-        trajectory: along the geodesic between samples, the covariance linear in time.
+        T_map_ring (M, 4, 4) and covariance (M, 6, 6) of rings (M,) at `stamps` (M,).
+
+        `rings` are numbers, `stamps` within the trajectory. Poses go along the geodesic between
+        samples, the covariance linearly in time.
         """
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, max(len(self.stamps) - 1, 1))
         before, after = after - 1, np.minimum(after, len(self.stamps) - 1)
@@ -109,8 +114,10 @@ class Reconstruction:
 
     def save(self, path: str | Path, anomaly: np.ndarray | None = None) -> None:
         """
-        Write a `.ply` with x, y, z, sigma, the covariance's upper triangle, seconds since the
-        first point, the sensor's number and, if given, `anomaly` (N,).
+        Write a `.ply`.
+
+        It has x, y, z, sigma, the covariance's upper triangle, seconds since the first point, the
+        sensor's number and, if given, `anomaly` (N,).
         """
         if Path(path).suffix.lower() != '.ply':
             raise MapError(f'{path}: a reconstruction is written as .ply')
@@ -198,8 +205,10 @@ def reconstruct(
 
 class _Stack(NamedTuple):
     """
-    F frames of Z zones as arrays: stamps (F,), number of the sensor (F,), points (F, Z, 3),
-    ranges, sigma and usable (F, Z); and how many frames lie outside the trajectory's time.
+    F frames of Z zones as arrays.
+
+    Stamps (F,), number of the sensor (F,), points (F, Z, 3), ranges, sigma and usable (F, Z); and
+    how many frames lie outside the trajectory's time.
     """
 
     stamps: np.ndarray
@@ -253,8 +262,9 @@ def _stacked(
 
 def _on_body(points, trajectory, stamps, distance, samples=8):
     """
-    (F, Z) whether points (F, Z, 3) at `stamps` (F,) lie within `distance` of the backbone, which
-    is drawn through the base and the rings as a Hermite cubic (their x axes are its tangents).
+    (F, Z) whether points (F, Z, 3) at `stamps` (F,) lie within `distance` of the backbone.
+
+    It is drawn through the base and the rings as a Hermite cubic (their x axes are its tangents).
     """
     nodes = trajectory.T_map_ring.shape[1]
     u = np.linspace(0.0, 1.0, samples, endpoint=False)[:, None]
@@ -274,7 +284,7 @@ def _on_body(points, trajectory, stamps, distance, samples=8):
 
 @njit(cache=True)
 def _within(points, polyline, distance):
-    """(F, Z) whether each point (F, Z, 3) is within `distance` of its frame's polyline (F, K, 3)."""
+    """(F, Z) whether points (F, Z, 3) are within `distance` of their polyline (F, K, 3)."""
     out = np.zeros(points.shape[:2], np.bool_)
     for f in range(points.shape[0]):
         for z in range(points.shape[1]):
@@ -308,7 +318,11 @@ def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _point_covariance(
     R_map_ring, pose_covariance, T_ring_sensor, q_sensor, sigma, floor, beam_width
 ):
-    """(N, 3, 3) covariance in the map: the pose's share by its Jacobian, the beam's in its own axes."""
+    """
+    (N, 3, 3) covariance in the map.
+
+    The pose's share by its Jacobian, the beam's in its own axes.
+    """
     q_ring = _transform(T_ring_sensor, q_sensor)
     jacobian = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(q_ring), 3, 3)), -lie.hat(q_ring)], axis=2

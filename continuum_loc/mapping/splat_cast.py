@@ -1,4 +1,8 @@
-"""Where a ray first crosses the mapped surface, each map point taken as a small disc on its tangent plane."""
+"""
+Where a ray first crosses the mapped surface.
+
+Each map point is taken as a small disc on its tangent plane.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +61,9 @@ def _cast(arrays, normals, origins, directions, lengths, radius, min_cos, orient
 @njit(cache=True)
 def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos, oriented):
     """
-    March through the index's blocks (Amanatides and Woo, 1987) until the next one lies beyond the
-    best crossing.
+    March through the index's blocks (Amanatides and Woo, 1987).
+
+    The march ends where the next block lies beyond the best crossing.
 
     A disc is looked for in the block of its centre only. One that reaches from a neighbouring
     block, through which

@@ -27,7 +27,8 @@ import numpy as np
 
 BLOCK = 4  # voxels along a block's edge
 BLOCK_VOXELS = BLOCK**3
-POINTS_PER_VOXEL = 2.0  # mean over occupied voxels; makes lists of about 12, where their length and number balance
+# Mean over occupied voxels; makes lists of about 12, where their length and number balance.
+POINTS_PER_VOXEL = 2.0
 AXIS_BITS = 21
 AXIS_MASK = (1 << AXIS_BITS) - 1
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)
@@ -100,7 +101,7 @@ def _find_slot(slots, key, mask):
 
 @njit(cache=True, inline='always')
 def _voxel_in_block(i, j, k):
-    """Number of a voxel within its block, 0..63, in Morton order (each coordinate 0..3)."""
+    """Encode a voxel's place in its block, 0..63, in Morton order (each coordinate 0..3)."""
     return (
         ((i & 2) << 4)
         | ((j & 2) << 3)
@@ -124,7 +125,11 @@ def _spread_bits(value):
 
 @njit(cache=True)
 def _morton_codes(points, origin, inverse_voxel):
-    """(P,) Morton code of each point's voxel; the lowest 6 bits number the voxel within its block."""
+    """
+    (P,) Morton code of each point's voxel.
+
+    The lowest 6 bits number the voxel within its block.
+    """
     codes = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
         i = np.int64(np.floor((points[p, 0] - origin[0]) * inverse_voxel))
@@ -136,7 +141,7 @@ def _morton_codes(points, origin, inverse_voxel):
 
 @njit(cache=True)
 def _fill_blocks(codes, keys, block_slots, voxel_start):
-    """Enter the sorted points' blocks in the hash table and note where each voxel's points start."""
+    """Enter the sorted points' blocks in the hash table; note where each voxel's points start."""
     block, last, voxel = -1, np.int64(-1), 0
     for p in range(codes.shape[0]):
         if codes[p] >> 6 != last:
@@ -167,7 +172,11 @@ def _block_range(u, reach, count):
 
 @njit(cache=True, inline='always')
 def _voxel_range(u, radius):
-    """Half-open range, within 0..4, of a block's voxels that u +- radius covers; u in voxels from the block."""
+    """
+    Half-open range, within 0..4, of a block's voxels that u +- radius covers.
+
+    u in voxels from the block.
+    """
     return int(max(np.floor(u - radius), 0.0)), int(min(np.floor(u + radius), BLOCK - 1.0)) + 1
 
 
@@ -187,9 +196,9 @@ def _scan_block(
     points, start, normals, number, u, v, w, radius, x, y, z, dx, dy, dz, min_cos, best, best2
 ):
     """
-    Improve (best sorted point, squared distance) by the points of one block in the voxels that the
-    ball touches;
-    u, v, w: the place in voxels from the block's corner.
+    Improve (best sorted point, squared distance) by the points of one block.
+
+    Only in the voxels that the ball touches; u, v, w: the place in voxels from the block's corner.
     """
     i0, i1 = _voxel_range(u, radius)
     j0, j1 = _voxel_range(v, radius)
@@ -213,8 +222,9 @@ def _scan_block(
 @njit(cache=True)
 def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2):
     """
-    (best sorted point or -1, squared distance) of the points nearer than sqrt(best2), in boxes
-    that double until one is sure to hold the nearest. With min_cos = -1 every point counts and
+    (best sorted point or -1, squared distance) of the points nearer than sqrt(best2).
+
+    Boxes double until one is sure to hold the nearest. With min_cos = -1 every point counts and
     `normals` is not read.
     """
     points, slots, start, scale = (
@@ -275,7 +285,11 @@ def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2):
 
 @njit(cache=True)
 def _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
-    """Go on with `_search` over the table of blocks: cheaper than empty space once that is the larger of the two."""
+    """
+    Go on with `_search` over the table of blocks.
+
+    Cheaper than empty space once that is the larger of the two.
+    """
     points, slots, start, scale = (
         arrays.points,
         arrays.block_slots,
@@ -312,7 +326,11 @@ def _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
 
 @njit(cache=True, inline='always')
 def _never_nearest(points, p, pool, other, x, y, z, edge):
-    """Whether `pool[other]` is closer than `points[p]` at every place of the box (centre x, y, z)."""
+    """
+    Whether `pool[other]` is closer than `points[p]` at every place of the box (x, y, z).
+
+    x, y, z is its centre.
+    """
     p2 = _distance2(points, p, x, y, z)
     other2 = _distance2(pool, other, x, y, z)
     swing = edge * (
@@ -326,9 +344,10 @@ def _never_nearest(points, p, pool, other, x, y, z, edge):
 @njit(cache=True)
 def _gather(arrays, x, y, z, radius, used):
     """
-    Write to the pool, after row `used`, the points within `radius` that row `used` does not rule
-    out (row `used` itself is among them, so it is written twice and the first one dropped by the
-    caller). The end of what was written, or -1 when there are more than GATHER_LIMIT.
+    Write to the pool, after row `used`, the points within `radius` that it does not rule out.
+
+    Row `used` itself is among them, so it is written twice and the first one dropped by the
+    caller. Returns the end of what was written, or -1 when there are more than GATHER_LIMIT.
     """
     points, slots, start, scale = (
         arrays.points,
@@ -394,7 +413,11 @@ def _gather_block(points, start, pool, number, u, v, w, reach, x, y, z, edge, us
 
 @njit(cache=True)
 def _prune(pool, used, end, x, y, z, edge):
-    """Drop from pool rows used..end those ruled out by the one nearest to some corner of the box; the new end."""
+    """
+    Drop from pool rows used..end those ruled out by the one nearest to some corner of the box.
+
+    Returns the new end.
+    """
     for corner in range(8):
         qx = x + edge * ((corner & 1) - 0.5)
         qy = y + edge * (((corner >> 1) & 1) - 0.5)
@@ -421,8 +444,9 @@ def _prune(pool, used, end, x, y, z, edge):
 @njit(cache=True)
 def _make_list(arrays, x, y, z, used):
     """
-    Write the candidate list of the cell with this centre at pool row `used`: its length (0: no
-    point within reach), or -1 where it would be too long.
+    Write the candidate list of the cell with this centre at pool row `used`.
+
+    Returns its length (0: no point within reach), or -1 where it would be too long.
     """
     half_diagonal = 0.5 * np.sqrt(3.0) * arrays.voxel
     limit = arrays.reach + half_diagonal
@@ -443,8 +467,9 @@ def _make_list(arrays, x, y, z, used):
 @njit(cache=True)
 def _visit(arrays, key, row):
     """
-    Count a visit to a cell that has no list, in row `row` of the table; from the PATIENCE-th on it
-    gets one. The cell's entry.
+    Count a visit to a cell that has no list, in row `row` of the table.
+
+    From the PATIENCE-th on it gets one. Returns the cell's entry.
     """
     slots = arrays.cell_slots
     table = slots.shape[0] - COUNTERS
@@ -514,7 +539,11 @@ def _nearest_listed(pool, entry, x, y, z, limit2):
 
 @njit(cache=True)
 def _nearest_facing_listed(pool, normals, entry, x, y, z, dx, dy, dz, min_cos, limit2):
-    """Nearest of a cell's candidates that face: (pool row or -1, squared distance, whether none is nearer)."""
+    """
+    Nearest of a cell's candidates that face.
+
+    (pool row or -1, squared distance, whether none is nearer).
+    """
     best, best2, any2 = -1, limit2, limit2
     start = entry >> 16
     for c in range(start, start + (entry & 0xFFFF)):
@@ -537,8 +566,9 @@ def _nearest_searched(arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2):
 @njit(cache=True)
 def nearest(arrays, x, y, z, max_distance):
     """
-    (row of the nearest point in the caller's cloud, squared distance [m^2]), or (-1, inf) when
-    none lies strictly within `max_distance` [m] or the query is not finite.
+    (row of the nearest point in the caller's cloud, squared distance [m^2]), or (-1, inf).
+
+    The latter when none lies strictly within `max_distance` [m] or the query is not finite.
     """
     index, distance2 = np.int64(-1), np.inf
     key = _cell_key(arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel, x, y, z)
@@ -595,7 +625,7 @@ def nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
 
 @njit(cache=True)
 def _stored_list(slots, key):
-    """A cell's packed list, or -1 where there is none (yet)."""
+    """Return a cell's packed list, or -1 where there is none (yet)."""
     if key < 0:
         return np.int64(-1)
     row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
@@ -624,7 +654,11 @@ def nearest_batch(arrays, queries, max_distance, index, distance2):
 def nearest_facing_batch(
     arrays, normals, queries, directions, max_distance, min_cos, index, distance2
 ):
-    """`nearest_facing` for queries (Q, 3) along directions (Q, 3), into index (Q,) and distance2 (Q,)."""
+    """
+    `nearest_facing` for queries (Q, 3) along directions (Q, 3).
+
+    Written into index (Q,) and distance2 (Q,).
+    """
     slots, pool, within = arrays.cell_slots, arrays.pool, max_distance <= arrays.reach
     x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel
     for q in range(queries.shape[0]):
@@ -676,7 +710,7 @@ class VoxelIndex:
         self.arrays = _build(points, self.voxel, float(reach), self._cache_cells)
 
     def copy(self) -> VoxelIndex:
-        """An index of the same cloud with a cache of its own (for another thread)."""
+        """Return an index of the same cloud with a cache of its own (for another thread)."""
         twin = object.__new__(VoxelIndex)
         twin.__dict__.update(self.__dict__)
         cell_slots, pool = _empty_cache(self._cache_cells)
@@ -685,7 +719,11 @@ class VoxelIndex:
 
     @property
     def cache_use(self) -> dict[str, int]:
-        """Counts: `cells` with a list now, `candidates` in them, `made` lists since the start, times `emptied`."""
+        """
+        Count `cells` with a list now, `candidates` in them, lists `made`, and times `emptied`.
+
+        The last two since the start.
+        """
         counters = self.arrays.cell_slots[-COUNTERS:].ravel()
         return dict(
             zip(('cells', 'candidates', 'made', 'emptied'), map(int, counters), strict=True)
@@ -694,7 +732,11 @@ class VoxelIndex:
     def nearest(
         self, queries: np.ndarray, max_distance: float = np.inf
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3); -1 and inf where none."""
+        """
+        Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3).
+
+        -1 and inf where none.
+        """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
         nearest_batch(self.arrays, queries, float(max_distance), index, distance2)
@@ -707,7 +749,11 @@ class VoxelIndex:
         max_distance: float = np.inf,
         min_cos: float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As `nearest`, among points whose normal n has -(n . d) >= min_cos for the ray directions (Q, 3)."""
+        """
+        As `nearest`, among points whose normals face the rays.
+
+        A normal n faces the ray direction d of (Q, 3) where -(n . d) >= min_cos.
+        """
         if not self._has_normals:
             raise MapError('nearest_facing needs an index made with normals')
         queries = np.ascontiguousarray(queries, dtype=np.float64)
@@ -741,7 +787,7 @@ def _checked_rows(rows: np.ndarray, name: str) -> np.ndarray:
 
 
 def _suitable_voxel(points: np.ndarray) -> float:
-    """Voxel edge at which occupied voxels hold about POINTS_PER_VOXEL points, for points on a surface."""
+    """Voxel edge at which occupied voxels hold about POINTS_PER_VOXEL points of a surface."""
     extent = float(np.ptp(points, axis=0).max())
     if extent == 0.0:
         return 1.0
@@ -796,7 +842,11 @@ def _empty_cache(cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spatial_order(points: np.ndarray, voxel: float) -> np.ndarray:
-    """(P,) rows of the points along a Morton curve through voxels of this edge [m]: neighbours lie close in memory."""
+    """
+    (P,) rows of the points along a Morton curve through voxels of this edge [m].
+
+    Neighbours lie close in memory.
+    """
     return np.argsort(_morton_codes(points, points.min(axis=0), 1.0 / voxel), kind='stable')
 
 

@@ -112,7 +112,7 @@ class EstimatorNode(WorkerNode):
         )
 
     def summary(self) -> dict[str, Any]:
-        """Adds the filter's own counts."""
+        """Add the filter's own counts."""
         return super().summary() | {'filter': self.filter.counts}
 
     # ------------------------------------------------ outputs
@@ -187,7 +187,7 @@ class EstimatorNode(WorkerNode):
         return folder / name
 
     def _initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """The base's present pose, as RViz's tool gives it; the estimate starts anew from it."""
+        """Take the base's present pose, as RViz's tool gives it, and start the estimate anew."""
         try:
             pose = tracked_pose(message, 'base', 'initialpose')
         except ConvertError as error:
@@ -219,7 +219,7 @@ class EstimatorNode(WorkerNode):
         return SlidingWindowFilter(robot, self.prior_map, self.filter_settings)
 
     def _preset(self) -> EstimatorSettings:
-        """The settings asked for, else those bundled for this robot, else the library's defaults."""
+        """Use the settings asked for, else those bundled for this robot, else the library's."""
         bundled = (PRESETS_FOLDER / f'{self.robot.name}.yaml').is_file()
         if not self.settings.settings and not bundled:
             self.get_logger().warning(
@@ -247,7 +247,7 @@ def with_base(
     robot: RobotDescription, T_map_base: np.ndarray, covariance: np.ndarray, insertion: float
 ) -> RobotDescription:
     """
-    The robot with its base at a pose (4, 4) given at the present insertion [m].
+    Move the robot's base to a pose (4, 4) given at the present insertion [m].
 
     A covariance of zeros keeps the robot's own.
     """

@@ -1,6 +1,7 @@
 """
-From messages to measurements that may be used: a queue that degrades in a defined order, and rules
-for stamps.
+From messages to measurements that may be used.
+
+A queue that degrades in a defined order, and rules for stamps.
 
 Nothing here imports rclpy, so that all of it is tested without a graph.
 """
@@ -39,8 +40,9 @@ SACRIFICE = ('tof/points', 'strain', 'imu/mag', TRACKER, 'joint_states', 'imu/da
 
 class Queued(NamedTuple):
     """
-    A message as it arrived: its place, topic, message, ROS time (ns) and monotonic time (s) of
-    arrival.
+    A message as it arrived.
+
+    Its place, topic, message, ROS time (ns) and monotonic time (s) of arrival.
 
     place: stamp (ns), or the arrival where that is earlier, as stamps from the future must not
     hold up others; then the order of arrival.
@@ -86,7 +88,7 @@ class Inbox:
             self._ready.notify()
 
     def take(self, timeout: float) -> Queued | None:
-        """The message whose turn it is, or None when none came within `timeout` seconds."""
+        """Return the message whose turn it is, or None when none came within `timeout` seconds."""
         with self._ready:
             if self._size == 0:
                 self._ready.wait(timeout)
@@ -117,7 +119,7 @@ class Inbox:
 
 
 def rough_stamp(message: Any, arrival: int) -> int:
-    """The stamp (ns) of a message that was not checked yet: good enough to sort by."""
+    """Read the stamp (ns) of a message that was not checked yet: good enough to sort by."""
     header = getattr(message, 'header', None)
     if header is not None:
         return header.stamp.sec * NANOSECONDS + header.stamp.nanosec
@@ -208,7 +210,11 @@ class Intake:
         }
 
     def accept(self, topic: str, message: Any, arrival: int, now: int) -> Measurement | None:
-        """The measurement of a message, or None where it is refused (counted, and reported once per class)."""
+        """
+        Return the measurement of a message, or None where it is refused.
+
+        A refusal is counted, and reported once per class.
+        """
         try:
             measurement = self._checked(topic, message, arrival)
             refusal = self.gate.judge(

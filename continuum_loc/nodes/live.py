@@ -126,8 +126,9 @@ def run_live(
     progress: Callable[[str, float], None] | None = None,
 ) -> LiveResult:
     """
-    Simulate, estimate and record live over real ROS 2, `duration` seconds of data, into
-    `folder`/bag.
+    Simulate, estimate and record live over real ROS 2 into `folder`/bag.
+
+    For `duration` seconds of data.
 
     robot, scene, prior_map, settings: bundled names or files. domain_id: ROS_DOMAIN_ID of the
     private graph (default: one from the process id). progress(stage, share): called as it goes on,
@@ -205,7 +206,11 @@ def _follow(
 
 
 def _environment(domain_id: int | None) -> dict[str, str]:
-    """The children's: a graph of their own on this machine, and one thread for each numerical library."""
+    """
+    Make the children's environment.
+
+    A graph of their own on this machine, and one thread for each numerical library.
+    """
     domain = domain_id if domain_id is not None else 1 + os.getpid() % 100
     own = {
         'ROS_DOMAIN_ID': str(domain),

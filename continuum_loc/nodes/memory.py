@@ -1,4 +1,8 @@
-"""What the estimator node keeps of the past, in bounded memory: the newest trajectory, and the scene it saw."""
+"""
+What the estimator node keeps of the past, in bounded memory.
+
+The newest trajectory, and the scene it saw.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,7 @@ class Trajectory:
             self._poses.popleft()
 
     def recent(self, count: int) -> list[int]:
-        """The newest `count` stamps."""
+        """Return the newest `count` stamps."""
         return [stamp for stamp, _ in list(self._poses)[-count:]]
 
     def track(self, robot: RobotDescription) -> Track:
@@ -54,11 +58,15 @@ class SeenScene:
         self._seen: deque[tuple[int, np.ndarray]] = deque()
 
     def see(self, frame: TofFrame) -> None:
-        """A frame that the next estimate places."""
+        """Keep a frame that the next estimate places."""
         self._waiting.append(frame)
 
     def place(self, estimate: Estimate, duration: float) -> None:
-        """Place the waiting frames by an estimate made at their instant; forget what is older than `duration` [s]."""
+        """
+        Place the waiting frames by an estimate made at their instant.
+
+        What is older than `duration` [s] is forgotten.
+        """
         frames = [
             frame
             for frame in self._waiting
@@ -85,7 +93,7 @@ class SeenScene:
         return np.concatenate([np.empty((0, 4)), *(points for _, points in list(self._seen))])
 
     def record(self, stamp: int, anomaly: np.ndarray | None = None) -> CloudRecord:
-        """The points as the `reconstruction` topic carries them."""
+        """Return the points as the `reconstruction` topic carries them."""
         x, y, z, sigma = self.columns().T
         return CloudRecord(
             stamp,

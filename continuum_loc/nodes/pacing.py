@@ -1,4 +1,8 @@
-"""Samples of the future at the right time: a thread prepares them ahead, a caller publishes them when due."""
+"""
+Samples of the future at the right time.
+
+A thread prepares them ahead, a caller publishes them when due.
+"""
 
 from __future__ import annotations
 

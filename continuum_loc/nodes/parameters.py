@@ -1,6 +1,7 @@
 """
-Typed settings as ROS parameters: declared with description, unit and range, read back, and guarded
-while running.
+Typed settings as ROS parameters.
+
+Declared with description, unit and range, read back, and guarded while running.
 
 A nested group becomes a dotted name (`filter.tof.gate`); a tuple of numbers an array. The pydantic
 model stays the only place where names, defaults and limits are written down.
@@ -50,14 +51,18 @@ def declare(node: Node, defaults: S, prefix: str = '') -> S:
 
 
 def read(node: Node, model: type[S], prefix: str = '', changed: dict[str, Any] | None = None) -> S:
-    """Settings of the node's present parameters, with `changed` values in their place."""
+    """Read the settings of the node's present parameters, with `changed` values in their place."""
     return parse_settings(
         model, _nested(node, model, prefix, changed or {}), where=f'{node.get_name()} parameters'
     )
 
 
 def refuse_unknown(node: Node) -> None:
-    """Raise SettingsError if a file or the command line sets a parameter that the node does not have."""
+    """
+    Raise SettingsError where a parameter is set that the node does not have.
+
+    A file or the command line may set it.
+    """
     valid = list(
         node._parameters
     )  # rclpy has no public list of what was declared and what was overridden
@@ -72,7 +77,11 @@ def refuse_unknown(node: Node) -> None:
 
 
 def guard(node: Node, apply: Callable[[dict[str, Any]], str | None]) -> None:
-    """Ask `apply` about every change at run time: it returns the reason why not, or None when it took the values."""
+    """
+    Ask `apply` about every change at run time.
+
+    It returns the reason why not, or None when it took the values.
+    """
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         values = {p.name: _plain(p.value) for p in parameters if p.name not in _ROS_NAMES}
@@ -86,7 +95,11 @@ def guard(node: Node, apply: Callable[[dict[str, Any]], str | None]) -> None:
 
 
 def live_fields(model: type[Settings]) -> set[str]:
-    """Names of the fields that may change while the node runs (declared with json_schema_extra live=True)."""
+    """
+    Names of the fields that may change while the node runs.
+
+    They are declared with json_schema_extra live=True.
+    """
     return {
         name
         for name, field in model.model_fields.items()
@@ -133,7 +146,7 @@ def _ros_value(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A parameter's value without array.array."""
+    """Return a parameter's value without array.array."""
     return value if isinstance(value, (str, bool, int, float, type(None))) else list(value)
 
 
@@ -164,7 +177,7 @@ def _descriptor(name: str, field: FieldInfo, value: Any) -> ParameterDescriptor:
 
 
 def _limits(field: FieldInfo) -> tuple[float | None, float | None]:
-    """Closed bounds; an open one (`gt`) is refused by the model itself when it is set."""
+    """Give closed bounds; an open one (`gt`) is refused by the model itself when it is set."""
     low = high = None
     for item in field.metadata:
         low = next(
@@ -179,7 +192,7 @@ def _limits(field: FieldInfo) -> tuple[float | None, float | None]:
 
 
 def constraint(field: FieldInfo) -> str:
-    """The limits of a field in words; empty where it has none."""
+    """Put the limits of a field in words; empty where it has none."""
     if get_origin(field.annotation) is Literal:
         return 'one of: ' + ', '.join(map(str, get_args(field.annotation)))
     signs = (('ge', '>='), ('gt', '>'), ('le', '<='), ('lt', '<'))

@@ -1,4 +1,8 @@
-"""Node `recorder`: the topics of the contract into a bag that `ros2 bag` and `continuum-loc replay` read."""
+"""
+Node `recorder`: the topics of the contract into a bag.
+
+`ros2 bag` and `continuum-loc replay` read it.
+"""
 
 from __future__ import annotations
 

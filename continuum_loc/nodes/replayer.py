@@ -1,4 +1,8 @@
-"""Node `replayer`: a bag's sensors and truth back onto the graph, with /clock, as `ros2 bag play --clock` does."""
+"""
+Node `replayer`: a bag's sensors and truth back onto the graph.
+
+With /clock, as `ros2 bag play --clock` does.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +102,7 @@ class ReplayerNode(PackageNode):
         self.finish()
 
     def _wait_for_listeners(self) -> None:
-        """Begin when as many subscriptions as asked for listen to the bag's busiest kind of sensor."""
+        """Begin when enough subscriptions listen to the bag's busiest kind of sensor."""
         first = next(
             (topic for topic in INPUTS if topic in self.outputs), next(iter(self.outputs))
         )
@@ -117,7 +121,7 @@ class ReplayerNode(PackageNode):
             time.sleep(SETTLED_MATCH)
 
     def _entries(self) -> Iterator[tuple[int, tuple[str, bytes]]]:
-        """The bag's messages, and ticks of the clock between them."""
+        """Yield the bag's messages, and ticks of the clock between them."""
         period = nanoseconds(1.0 / self.settings.clock_rate)
         tick = 0
         for topic, stamp, data in raw_messages(

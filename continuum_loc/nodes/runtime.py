@@ -72,7 +72,7 @@ class PackageNode(Node):
         )
 
     def now(self) -> int:
-        """The node's clock in integer nanoseconds (0 while a simulated clock has not begun)."""
+        """Read the node's clock in integer nanoseconds (0 while simulated time has not begun)."""
         return self.get_clock().now().nanoseconds
 
     def check_parameters(self) -> None:
@@ -98,7 +98,8 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except Exception as error:  # a signal may surface as any of rclpy's errors, from a publish in flight for instance
+    except Exception as error:
+        # A signal may surface as any of rclpy's errors, from a publish in flight for instance.
         if rclpy.ok():
             return _complain(error)
     finally:
@@ -136,7 +137,11 @@ def _provide_log_folder() -> None:
 
 
 def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
-    """Best effort hears reliable and best-effort publishers alike; the depth bridges a slow moment."""
+    """
+    Best effort hears reliable and best-effort publishers alike.
+
+    The depth bridges a slow moment.
+    """
     reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=reliability)
 

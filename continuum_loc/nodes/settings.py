@@ -13,7 +13,7 @@ from pydantic import Field
 
 
 def _live(default: Any, **rest: Any) -> Any:
-    """A field that may change while the node runs."""
+    """Describe a field that may change while the node runs."""
     return Field(default, json_schema_extra={'live': True}, **rest)
 
 

@@ -1,4 +1,8 @@
-"""Node `shape`: Hall sensors and IMUs in, module poses and the fitted curve out (see config/shape.yaml)."""
+"""
+Node `shape`: Hall sensors and IMUs in, module poses and the fitted curve out.
+
+See config/shape.yaml.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +60,7 @@ class ShapeNode(WorkerNode):
         self.estimate = None
 
     def describe(self) -> tuple[int, str, dict[str, Any]]:
-        """A faulty module is an error, taring a warning."""
+        """Report a faulty module as an error, taring as a warning."""
         status, faults = self.estimator.status, self.estimator.faults
         values = {
             'status': status,
@@ -74,7 +78,7 @@ class ShapeNode(WorkerNode):
         return OK, 'tracking', values
 
     def summary(self) -> dict[str, Any]:
-        """Adds the estimator's own counts."""
+        """Add the estimator's own counts."""
         return super().summary() | {'estimator': dict(self.estimator.counts)}
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -88,7 +92,11 @@ class ShapeNode(WorkerNode):
 
 
 def frames_along(points: np.ndarray) -> np.ndarray:
-    """(C, 4, 4) frames on a curve (C, 3): x along it, turning as little as possible from the map's axes."""
+    """
+    (C, 4, 4) frames on a curve (C, 3).
+
+    x along it, turning as little as possible from the map's axes.
+    """
     tangents = np.gradient(points, axis=0)
     x = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
     seed = np.where(np.abs(x[:, 2:3]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])

@@ -1,4 +1,8 @@
-"""Node `simulator`: a robot in a scene, publishing every sensor in real time (see config/simulator.yaml)."""
+"""
+Node `simulator`: a robot in a scene, publishing every sensor in real time.
+
+See config/simulator.yaml.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +65,7 @@ class SimulatorNode(PackageNode):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the simulation and write the summary; raise what ended the simulation, if anything did."""
+        """Stop the simulation and write the summary; raise what ended the simulation, if any."""
         self._paced.stop()
         self._state = self._state if self._state == 'finished' else 'stopped'
         self._thread.join(timeout=10.0)
@@ -144,7 +148,11 @@ class SimulatorNode(PackageNode):
         return True
 
     def _begin(self, first: int) -> None:
-        """The first sample is due one lookahead from now: from there, data time is the node's clock."""
+        """
+        Let the first sample be due one lookahead from now.
+
+        From there, data time is the node's clock.
+        """
         self._shift = self.now() + round(self.settings.lookahead * 1e9) - first
         self.get_logger().info('data begins')
 

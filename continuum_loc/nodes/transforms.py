@@ -42,7 +42,11 @@ def transform_message(
 def body_transforms(
     make: Messages, robot: RobotDescription, prefix: str, stamp: int, T_map_ring: np.ndarray
 ) -> list:
-    """Map -> base_link, and base_link -> each ring, of T_map_ring (R + 1, 4, 4) with the base first."""
+    """
+    Map -> base_link, and base_link -> each ring, of T_map_ring (R + 1, 4, 4).
+
+    The base is first.
+    """
     base = prefix + BASE_LINK
     T_base_ring = lie.inverse(T_map_ring[0]) @ T_map_ring[1:]
     rings = [
@@ -63,7 +67,7 @@ def sensor_transforms(make: Messages, robot: RobotDescription, prefix: str, stam
 
 
 def broadcaster(node: Node, robot: RobotDescription, prefix: str) -> Broadcaster | None:
-    """A broadcaster on /tf and /tf_static, or None where tf2_msgs is not installed."""
+    """Make a broadcaster on /tf and /tf_static, or None where tf2_msgs is not installed."""
     if importlib.util.find_spec('tf2_msgs') is None:
         return None
     return Broadcaster(node, robot, prefix)

@@ -58,7 +58,7 @@ class ViewerNode(PackageNode):
         self.server.server_close()
 
     def state(self) -> dict[str, Any]:
-        """What the page shows, without the map."""
+        """Return what the page shows, without the map."""
         shown = {name: points for name, points in self.newest.items() if name != 'map'}
         return shown | {
             'status': [self.status[name] for name in sorted(self.status)],

@@ -1,4 +1,8 @@
-"""Compile everything before data flows: run a throw-away filter on made-up samples of the robot at rest."""
+"""
+Compile everything before data flows.
+
+A throw-away filter runs on made-up samples of the robot at rest.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +30,10 @@ def rest_samples(
     robot: RobotDescription, duration: float, start: int = NANOSECONDS
 ) -> Iterator[Measurement]:
     """
-    Samples in order of their stamps of a straight robot that rests in a tube of 0.5 m, with a
-    little seeded noise: a sensor that repeats itself to the last bit is refused as frozen.
+    Make samples, in order of their stamps, of a straight robot that rests in a tube of 0.5 m.
+
+    They have a little seeded noise: a sensor that repeats itself to the last bit is refused as
+    frozen.
     """
     rng = np.random.default_rng(0)
     tick = 1.0 / max(robot.imu_model.rate, 1.0)
@@ -45,8 +51,9 @@ def rest_samples(
 
 def warm_up(filter_: Any, robot: RobotDescription, window: float) -> None:
     """
-    Compile every kernel that `filter_` uses by running it past its first marginalisation, then
-    reset it.
+    Compile every kernel that `filter_` uses, then reset it.
+
+    It runs past its first marginalisation for that.
 
     The tube is not what the map shows, so that the search for a lost body runs, and compiles, too.
     """

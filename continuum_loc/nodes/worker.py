@@ -36,7 +36,11 @@ PLAUSIBLE_LATENCY = (
 
 
 class WorkerNode(PackageNode):
-    """Base of `estimator` and `shape`: subclasses give `inputs`, `consume`, `restart` and `describe`."""
+    """
+    Base of `estimator` and `shape`.
+
+    Subclasses give `inputs`, `consume`, `restart` and `describe`.
+    """
 
     inputs: tuple[str, ...] = ()
 
@@ -59,7 +63,11 @@ class WorkerNode(PackageNode):
     # ------------------------------------------------ for subclasses
 
     def consume(self, measurement: Measurement) -> int | None:
-        """Use one measurement, publish what follows from it, and return the stamp of the estimate if there is one."""
+        """
+        Use one measurement and publish what follows from it.
+
+        Returns the stamp of the estimate if there is one.
+        """
         raise NotImplementedError
 
     def restart(self) -> None:
@@ -71,7 +79,7 @@ class WorkerNode(PackageNode):
         raise NotImplementedError
 
     def summary(self) -> dict[str, Any]:
-        """What the summary file holds."""
+        """Return what the summary file holds."""
         return {
             'counts': self.counts(),
             'latency_ms': self.latency.statistics(),
@@ -106,7 +114,11 @@ class WorkerNode(PackageNode):
         write_summary(self.settings.summary_file, self.summary())
 
     def counts(self) -> dict[str, Any]:
-        """What was received, used, refused (by class of error) and dropped (by topic) before the estimator."""
+        """
+        Count what was received, used, refused and dropped before the estimator.
+
+        Refused by class of error, dropped by topic.
+        """
         return {
             'received': dict(self.inbox.received),
             'used': dict(self.intake.used),
@@ -117,7 +129,11 @@ class WorkerNode(PackageNode):
         }
 
     def in_worker(self, task: Callable[[], None]) -> None:
-        """Have the worker do `task` before its next message (services and parameters ask from other threads)."""
+        """
+        Have the worker do `task` before its next message.
+
+        Services and parameters ask from other threads.
+        """
         self._tasks.put(task)
 
     def publish(self, topic: str, item: Any) -> None:
@@ -130,7 +146,7 @@ class WorkerNode(PackageNode):
         self.publisher(topic).publish(message)
 
     def publisher(self, topic: str) -> Any:
-        """The publisher of a topic of the contract."""
+        """Return the publisher of a topic of the contract."""
         if topic not in self.outputs:
             spec = topic_spec(topic)
             self.outputs[topic] = self.create_publisher(

@@ -1,7 +1,7 @@
 """
-Write config/*.yaml from the typed settings, so that defaults are written down once:
+Write config/*.yaml from the typed settings, so that defaults are written down once.
 
-python -m continuum_loc.nodes.write_config config
+    python -m continuum_loc.nodes.write_config config
 """
 
 from __future__ import annotations
@@ -33,21 +33,22 @@ NODES: dict[str, Settings] = {
     'viewer': ViewerNodeSettings(),
 }
 FILTER_NOTE = """\
-    # Every setting of the filter is a parameter too, named as in continuum_loc/estimator/settings.py, and comes before
-    # those of `settings`; a change while the node runs starts the estimate anew. `ros2 param list /estimator`
-    # names them, `ros2 param describe /estimator filter.tof.gate` explains one.
+    # Every setting of the filter is a parameter too, named as in
+    # continuum_loc/estimator/settings.py, and comes before those of `settings`; a change while
+    # the node runs starts the estimate anew. `ros2 param list /estimator` names them,
+    # `ros2 param describe /estimator filter.tof.gate` explains one.
     # filter.tof.gate: 0.12
 """
 
 
 def config_text(node: str) -> str:
-    """The commented YAML of a node's parameters at their defaults."""
+    """Write the commented YAML of a node's parameters at their defaults."""
     head = (
         f'# Parameters of node `{node}` at their defaults, '
         'by `python -m continuum_loc.nodes.write_config`.\n'
         f'#   ros2 run continuum_loc {node} --ros-args --params-file {node}.yaml -p name:=value\n'
-        '# [live] may change while the node runs (`ros2 param set`); '
-        'the others are refused then.\n/**:\n  ros__parameters:\n'
+        '# [live] may change while the node runs (`ros2 param set`); the others are refused then.'
+        '\n/**:\n  ros__parameters:\n'
     )
     return head + ''.join(_entries(NODES[node])) + (FILTER_NOTE if node == 'estimator' else '')
 
