@@ -1,4 +1,8 @@
-"""Anyone's own bags: the same tables, claims and report as for simulated trials, from a folder of recordings."""
+"""
+Anyone's own bags: the same tables, claims and report as for simulated trials.
+
+All from a folder of recordings.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +38,13 @@ class BagTrial:
 
     @property
     def name(self) -> str:
-        """The bag's folder or file without its ending."""
+        """Return the bag's folder or file without its ending."""
         return self.bag.stem if self.bag.is_file() else self.bag.name
 
 
 def bags_in(folder: Path) -> list[Path]:
     """
-    The bags directly in a folder: folders with a metadata.yaml, and single files.
+    List the bags directly in a folder: folders with a metadata.yaml, and single files.
 
     Raises BagsError.
     """

@@ -1,6 +1,7 @@
 """
-Benchmarks: ours beside what one would use instead, as ratios with spread, and a committed baseline
-of ratios.
+Benchmarks: ours beside what one would use instead, as ratios with spread.
+
+A baseline of ratios is committed.
 
 A benchmark NAME is a file `bench/NAME.py` of the source tree with `run(quick: bool) ->
 list[dict]`. Each row has `name`, `ours_s`, `peer`, `peer_s`, `ratio` (peer over ours, the median
@@ -29,7 +30,8 @@ from continuum_loc.evaluation.study import at_least, at_most, Claim, write_study
 
 BENCH_FOLDER = Path(__file__).parents[2] / 'bench'
 BASELINE = BENCH_FOLDER / 'baseline.json'
-SLACK = 0.25  # a ratio may fall by this share, or out of both runs' quartiles, whichever is more, before it counts
+# A ratio's fall counts beyond this share, or out of both runs' quartiles, whichever is more.
+SLACK = 0.25
 
 
 @contextmanager
@@ -56,7 +58,7 @@ class BenchOutcome:
     failures: list[str]
 
     def regressions(self, baseline: Path = BASELINE) -> list[str]:
-        """A line for each ratio that fell clearly below the committed one."""
+        """List a line for each ratio that fell clearly below the committed one."""
         if not baseline.is_file():
             raise BenchError(
                 f'{baseline}: no baseline to compare with; '
@@ -106,7 +108,11 @@ def run_bench(
     only: str | None = None,
     each: Callable[[list[str], str], Iterable[str]] = lambda names, label: names,
 ) -> BenchOutcome:
-    """Run one benchmark or all, and write `out/bench.json`, `.md`, `.csv`, `.tex` and `summary.json`."""
+    """
+    Run one benchmark or all, and write the results to `out`.
+
+    Files: `bench.json`, `.md`, `.csv`, `.tex` and `summary.json`.
+    """
     names = bench_names()
     if only is not None and only not in names:
         raise BenchError(f"no benchmark '{only}'; benchmarks: {', '.join(names)}")
@@ -142,7 +148,7 @@ def _load(name: str) -> ModuleType:
 def bound_claims(
     rows: list[dict[str, Any]], bounds: Iterable[tuple[str, str, str, float]]
 ) -> list[Claim]:
-    """The bounds that a benchmark states on its rows, each judged on the worst row that it is about."""
+    """Judge the bounds that a benchmark states on its rows, each on its worst row."""
     claims = []
     for text, field, sense, limit in bounds:
         values = [row[field] for row in rows if text in row['name'] and row.get(field) is not None]

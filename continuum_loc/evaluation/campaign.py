@@ -1,9 +1,10 @@
 """
-Many trials: several processes, one failure takes no other along, and an interrupted campaign
-continues.
+Many trials in several processes.
 
-OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay the same bag
-OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong
+One failure takes no other along, and an interrupted campaign continues.
+
+OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay
+the same bag OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong
 """
 
 from __future__ import annotations
@@ -40,7 +41,11 @@ class CampaignError(ValueError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a trial: its summary, or the error (last line of a traceback) that ended it."""
+    """
+    What became of a trial: its summary, or the error that ended it.
+
+    The error is the last line of a traceback.
+    """
 
     trial: Any  # a Trial, or a recorded one: what it must have is a `name`
     summary: dict[str, Any] | None
@@ -110,7 +115,11 @@ def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]
 
 
 def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterator[Any]:
-    """The same on the workers of a Dask cluster, which must see the same files under the same names."""
+    """
+    Do the same on the workers of a Dask cluster.
+
+    They must see the same files under the same names.
+    """
     try:
         from distributed import as_completed as as_distributed
         from distributed import Client

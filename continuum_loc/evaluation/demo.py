@@ -1,4 +1,8 @@
-"""The main job end to end: live over ROS 2, recorded, reported, and replayed from the bag without ROS."""
+"""
+The main job end to end.
+
+Live over ROS 2, recorded, reported, and replayed from the bag without ROS.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,11 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DemoOutcome:
-    """Where the demo's files are, its summary, and whether two replays of its bag agreed to the last bit."""
+    """
+    Where the demo's files are, its summary, and whether two replays of its bag agreed.
+
+    They agree when they are the same to the last bit.
+    """
 
     folder: Path
     bag: Path
@@ -36,7 +44,7 @@ class DemoOutcome:
 
 
 def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
-    """Run `trial` live into a new folder under `root`, replay its bag twice, and write the report."""
+    """Run `trial` live into a new folder under `root`, replay its bag twice, write the report."""
     from continuum_loc.nodes.live import run_live
 
     robot = load_robot(trial.robot)
@@ -90,7 +98,11 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
 
 
 def recorded_track(bag: Path, robot: RobotDescription) -> Track:
-    """The poses and backbones that the estimator published live, as the bag recorded them (no covariance)."""
+    """
+    Read the poses and backbones that the estimator published live, as the bag recorded them.
+
+    There is no covariance.
+    """
     from msg_tools.bag import read_bag
 
     poses, backbones = {}, {}
@@ -168,7 +180,7 @@ def replay_summary(live: ReplayResult, replayed: ReplayResult, identical: bool) 
 
 
 def demo_claims(result: ReplayResult, lost: dict[str, int], identical: bool) -> list[Claim]:
-    """The bounds that a live run has to keep."""
+    """Judge the bounds that a live run has to keep."""
     found = summarise(errors(result.track, result.truth))
     latency = distribution(1e3 * result.latency_seconds)
     dropped = sum(sum(result.counts[node]['dropped'].values()) for node in ('estimator', 'filter'))

@@ -1,4 +1,8 @@
-"""The tables of the localisation paper: mean and standard deviation over trials and rings, per condition."""
+"""
+Tables of the localisation paper.
+
+Mean and standard deviation over trials and rings, per condition.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,11 @@ COLUMNS = {
 
 
 def per_ring(outcomes: Iterable[Outcome], key: str, ring: str | None = None) -> np.ndarray:
-    """The figure `key` of each trial's rings (of one ring, or of all), one value per trial and ring."""
+    """
+    Collect the figure `key` of each trial's rings, one value per trial and ring.
+
+    Of one ring, or of all.
+    """
     return np.array(
         [
             entry[key]
@@ -37,7 +45,11 @@ def condition_table(
     group: Callable[[Outcome], str],
     paper: dict[str, tuple[str, ...]],
 ) -> list[dict[str, Any]]:
-    """One row per group in order of appearance: each of COLUMNS as `mean ± deviation`, and the paper's beside it."""
+    """
+    One row per group in order of appearance.
+
+    Each of COLUMNS as `mean ± deviation`, and the paper's beside it.
+    """
     rows = []
     for name in dict.fromkeys(group(outcome) for outcome in outcomes):
         members = [outcome for outcome in outcomes if group(outcome) == name]
@@ -106,8 +118,9 @@ def trial_rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 def mean(outcomes: Sequence[Outcome], key: str, factor: float = 1.0) -> float:
     """
-    Mean of a figure over trials and rings; nan where there is none, or where a trial failed: a
-    campaign that lost a trial proves nothing about its mean.
+    Mean of a figure over trials and rings; nan where there is none, or where a trial failed.
+
+    A campaign that lost a trial proves nothing about its mean.
     """
     values = per_ring(outcomes, key)
     complete = len(values) and all(outcome.summary is not None for outcome in outcomes)

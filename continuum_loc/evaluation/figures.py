@@ -127,7 +127,11 @@ def _band_traces(
 
 
 def component_figure(found: Errors, epoch: int) -> go.Figure:
-    """The six components of the pose error of one ring (chosen from a menu), each with its plus and minus 3 sigma."""
+    """
+    Plot the six components of the pose error of one ring, each with plus and minus 3 sigma.
+
+    The ring is chosen from a menu.
+    """
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
@@ -241,7 +245,11 @@ def time_histogram(milliseconds: np.ndarray, title: str, limit: float | None = N
 
 
 def consistency_figure(result: ReplayResult, found: Errors) -> go.Figure:
-    """What the filter says of itself (innovations) and what truth says of it (NEES), both 1 when honest."""
+    """
+    Plot what the filter says of itself and what truth says of it, both 1 when honest.
+
+    Innovations and NEES.
+    """
     import plotly.graph_objects as go
 
     epoch = int(result.track.stamps[0]) if len(result.track) else 0
@@ -275,7 +283,11 @@ def consistency_figure(result: ReplayResult, found: Errors) -> go.Figure:
 
 
 def scene_figure(around: Surroundings, shown: list[Moment], epoch: int) -> go.Figure:
-    """The 3-D view: surroundings that stay, and the body with its ToF points at each moment (slider and play)."""
+    """
+    Make the 3-D view: surroundings that stay, and the body with its ToF points at each moment.
+
+    It has a slider and a play button.
+    """
     import plotly.graph_objects as go
 
     still = _still_traces(around)
@@ -330,7 +342,7 @@ def scene_figure(around: Surroundings, shown: list[Moment], epoch: int) -> go.Fi
 
 
 def camera_towards(around: Surroundings, shown: list[Moment]) -> dict:
-    """A view from the side and above that fills the frame with where the body goes."""
+    """Look from the side and above, so that where the body goes fills the frame."""
     spread = np.concatenate(
         [around.vertices, around.map_points, *(moment.backbone for moment in shown)]
     )
@@ -480,7 +492,11 @@ def _play_buttons() -> dict:
 
 
 def thin(values: np.ndarray, most: int = MOST_SAMPLES) -> np.ndarray:
-    """Indices of at most `most` of the values (K,), keeping the greatest of each stretch, so that no peak is lost."""
+    """
+    Pick at most `most` of the values (K,) by index, keeping the greatest of each stretch.
+
+    So no peak is lost.
+    """
     if len(values) <= most:
         return np.arange(len(values))
     edges = np.linspace(0, len(values), most + 1).astype(int)

@@ -65,7 +65,11 @@ def errors(estimate: Track, truth: Track) -> Errors:
 
 
 def nees(pose_error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(...,) xi^T P^-1 xi of errors (..., n) with covariances (..., n, n); nan where P is not positive definite."""
+    """
+    (...,) xi^T P^-1 xi of errors (..., n) with covariances (..., n, n).
+
+    nan where P is not positive definite.
+    """
     usable = np.isfinite(covariance).all(axis=(-2, -1))
     safe = np.where(usable[..., None, None], covariance, np.eye(covariance.shape[-1]))
     usable &= np.linalg.eigvalsh(safe)[..., 0] > 0.0
@@ -76,8 +80,9 @@ def nees(pose_error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 def summarise(found: Errors) -> dict:
     """
-    Figures over all rings (the base is fixed by its mount, so it is reported apart), and for each
-    ring alone.
+    Figures over all rings, and for each ring alone.
+
+    The base is fixed by its mount, so it is reported apart.
 
     Keys: translation_mae_m, translation_rmse_m, rotation_mae_deg, rotation_rmse_deg, each with
     `_std` of the error, nees_per_dof, coverage_95, `rings` and `base` with the same keys.
@@ -138,8 +143,9 @@ def _rms(values: np.ndarray) -> float:
 
 def drift_band(found: Errors, ring: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    Three standard deviations of a ring's translation [m] and rotation [deg], each (K,): the root
-    of the summed variances, which bounds every direction.
+    Three standard deviations of a ring's translation [m] and rotation [deg], each (K,).
+
+    They are the root of the summed variances, which bounds every direction.
     """
     variance = found.sigma[:, ring] ** 2
     return (

@@ -1,4 +1,8 @@
-"""A still and a moving picture of a run: on the left the world as it is, on the right what the robot makes of it."""
+"""
+A still and a moving picture of a run.
+
+On the left the world as it is, on the right what the robot makes of it.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +98,7 @@ class _Painter:
 
 
 def between_rings(T_map_ring: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) frames along the body, of constant strain between the base and rings (R + 1, 4, 4)."""
+    """(N, 4, 4) frames along the body, of constant strain between base and rings (R + 1, 4, 4)."""
     share = np.arange(SECTIONS) / SECTIONS
     frames = lie.interpolate(
         T_map_ring[:-1, None],
@@ -105,7 +109,7 @@ def between_rings(T_map_ring: np.ndarray) -> np.ndarray:
 
 
 def dots(points: np.ndarray, radius: float, colour: tuple[float, float, float]) -> Shape:
-    """An octahedron of `radius` [m] at each of the points (N, 3)."""
+    """Put an octahedron of `radius` [m] at each of the points (N, 3)."""
     corners = radius * np.array(
         [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float
     )
@@ -119,8 +123,9 @@ def dots(points: np.ndarray, radius: float, colour: tuple[float, float, float]) 
 
 def _camera(low: np.ndarray, high: np.ndarray) -> Camera:
     """
-    From the side (against y) and a little above, so far away that the swept box fills the picture;
-    what lies before the body is cut away.
+    Look from the side (against y) and a little above, so that the swept box fills the picture.
+
+    What lies before the body is cut away.
     """
     middle, size = 0.5 * (low + high), np.maximum(high - low, 0.2)
     width, height = PANEL

@@ -1,4 +1,8 @@
-"""Run a filter over recorded measurements without a ROS graph: the same bag gives the same estimate, bit for bit."""
+"""
+Run a filter over recorded measurements without a ROS graph.
+
+The same bag gives the same estimate, bit for bit.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +48,11 @@ class Filter(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """M time-of-flight points as the estimate places them: stamps (M,) ns, points (M, 3) in `map` [m]."""
+    """
+    M time-of-flight points as the estimate places them.
+
+    Stamps (M,) ns, points (M, 3) in `map` [m].
+    """
 
     stamps: np.ndarray
     points: np.ndarray
@@ -81,7 +89,7 @@ class ReplayResult:
 
     @property
     def real_time_factor(self) -> float:
-        """Data time over processing time; nan when there was nothing to estimate."""
+        """Divide data time by processing time; nan when there was nothing to estimate."""
         return (
             self.data_seconds / self.processing_seconds if len(self.step_seconds) else float('nan')
         )
@@ -106,7 +114,11 @@ def samples_of(bag: str | Path) -> Iterator[Measurement | TruthSample]:
 def replay(
     source: str | Path | Iterable[Measurement | TruthSample], estimator: Filter
 ) -> ReplayResult:
-    """Feed a bag (its path) or samples in stamp order to `estimator`, in this thread, as fast as it goes."""
+    """
+    Feed a bag (its path) or samples in stamp order to `estimator`.
+
+    It runs in this thread, as fast as it goes.
+    """
     samples = samples_of(source) if isinstance(source, (str, Path)) else source
     log = _Log(estimator.robot)
     for sample in samples:
@@ -169,7 +181,7 @@ class _Log:
 
 
 def place_points(frames: Iterable[TofFrame], track: Track, robot: RobotDescription) -> Cloud:
-    """The valid points of `frames` in `map`, by the pose of their ring in `track` at their stamp."""
+    """Place the valid points of `frames` in `map`, by the pose of their ring at their stamp."""
     frames = list(frames)
     known = known_at(
         track.stamps, np.array([frame.stamp for frame in frames], np.int64), longest_gap=1.0

@@ -1,4 +1,8 @@
-"""One self-contained HTML page about a run: what it reached, where it was worst, and a 3-D view to turn."""
+"""
+One self-contained HTML page about a run.
+
+What it reached, where it was worst, and a 3-D view to turn.
+"""
 
 from __future__ import annotations
 
@@ -68,8 +72,10 @@ class Page:
 @dataclass(frozen=True, eq=False)
 class Context:
     """
-    What a run took place in: the scene's mesh (vertices, faces) and the prior map's points, where
-    known. `missing` says what could not be found.
+    What a run took place in.
+
+    The scene's mesh (vertices, faces) and the prior map's points, where known. `missing` says what
+    could not be found.
     """
 
     mesh: tuple[np.ndarray, np.ndarray] | None = None
@@ -85,7 +91,7 @@ def write_report(run: Run, context: Context | None = None) -> Path:
 
 
 def context_of(run: Run) -> Context:
-    """The scene and the prior map that the run's configuration names, where they can still be had."""
+    """Find the scene and the prior map that the run's configuration names, if they still are."""
     from continuum_loc.evaluation.trials import scene_map
     from continuum_loc.mapping.errors import MapError
     from continuum_loc.mapping.prior_map import load_map
@@ -111,7 +117,7 @@ def context_of(run: Run) -> Context:
 
 
 def render(page: Page) -> str:
-    """The page as HTML, with plotly's script inside, so that it needs no network."""
+    """Render the page as HTML, with plotly's script inside, so that it needs no network."""
     from jinja2 import Environment, PackageLoader
     from plotly.offline import get_plotlyjs
 
@@ -131,7 +137,7 @@ def render(page: Page) -> str:
 
 
 def run_page(run: Run, context: Context) -> Page:
-    """The page about one run."""
+    """Make the page about one run."""
     result, summary = run.result, run.summary
     found = errors(settled(result.track), result.truth)
     worst = worst_moments(found)
@@ -172,7 +178,7 @@ def run_page(run: Run, context: Context) -> Page:
 
 
 def chart(figure: Any) -> str:
-    """A figure as an HTML fragment that follows the page's width."""
+    """Render a figure as an HTML fragment that follows the page's width."""
     import plotly.io as pio
 
     return pio.to_html(
@@ -181,7 +187,7 @@ def chart(figure: Any) -> str:
 
 
 def subtitle(run: Run) -> str:
-    """What was run, in one line."""
+    """Say what was run, in one line."""
     names = {key: run.configuration.get(key) for key in ('scene', 'trajectory', 'profile', 'bag')}
     robot = run.configuration.get('robot')
     names = {'robot': robot.get('name') if isinstance(robot, Mapping) else robot, **names}
@@ -197,7 +203,7 @@ def subtitle(run: Run) -> str:
 
 
 def headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The figures that one wants to see first, as (label, value)."""
+    """Choose the figures that one wants to see first, as (label, value)."""
     cards = [
         ('translation, mean over rings', _number(summary['translation_mae_m'], 100, ' cm')),
         ('rotation, mean over rings', _number(summary['rotation_mae_deg'], 1, '°')),
@@ -219,7 +225,11 @@ def headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def ring_table(summary: Mapping[str, Any]) -> Table:
-    """MAE, RMSE, greatest error and consistency for each ring, for all of them, and for the base apart."""
+    """
+    MAE, RMSE, greatest error and consistency.
+
+    For each ring, for all of them, and for the base apart.
+    """
 
     def row(name: str, entry: Mapping[str, Any], total: bool = False) -> Row:
         lengths = [_number(entry[f'translation_{key}_m'], 100) for key in ('mae', 'rmse', 'max')]
@@ -266,8 +276,9 @@ def counts_table(counts: Mapping[str, Any]) -> Table:
 
 def worst_moments(found: Errors) -> np.ndarray:
     """
-    Indices of the instants with the greatest translation error of any ring, at least half a second
-    apart, the worst first.
+    Find the instants with the greatest translation error of any ring, the worst first.
+
+    They are indices, at least half a second apart.
     """
     if len(found) == 0:
         return np.empty(0, int)
@@ -342,7 +353,10 @@ def _error_groups(run: Run, found: Errors, epoch: int) -> Iterator[list[Part]]:
         return
     judged = associate(settled(run.result.track), run.result.truth)[0]
     lost = judged.status == 'lost' if judged.status is not None else np.zeros(len(found), bool)
-    shade = 'Grey: three standard deviations as the filter states them. Yellow: the filter says that it is lost.'
+    shade = (
+        'Grey: three standard deviations as the filter states them. '
+        'Yellow: the filter says that it is lost.'
+    )
     yield [
         Part(
             'Translation error, cm',

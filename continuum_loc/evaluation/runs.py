@@ -58,7 +58,11 @@ def new_run(kind: str, root: str | Path = 'runs') -> Path:
 
 
 def point_latest_at(folder: Path) -> None:
-    """Let `latest` beside `folder` lead to it; replaced in one step, so that it always leads somewhere."""
+    """
+    Let `latest` beside `folder` lead to it.
+
+    It is replaced in one step, so that it always leads somewhere.
+    """
     link = folder.parent / 'latest'
     if link.exists() and not link.is_symlink():
         raise RunError(f'{link} is in the way: it must be a link to the newest run')
@@ -103,7 +107,7 @@ def save_run(
 
 def summary_of(result: ReplayResult) -> dict[str, Any]:
     """
-    The figures of one run: errors (see `metrics.summarise`), speed, latency, counts.
+    Sum up one run: errors (see `metrics.summarise`), speed, latency, counts.
 
     Estimates made before the filter had found itself (`initialising`) are counted, and not judged.
     """
@@ -136,7 +140,11 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
 
 
 def settled(track: Track) -> Track:
-    """The instants at which the filter claims to know where it is, or to be lost: all but `initialising`."""
+    """
+    Find the instants at which the filter claims to know where it is, or to be lost.
+
+    All but `initialising`.
+    """
     return track if track.status is None else track.select(track.status != 'initialising')
 
 

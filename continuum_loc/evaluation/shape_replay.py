@@ -12,8 +12,9 @@ import numpy as np
 
 class ShapeReplay:
     """
-    `ShapeEstimator` in the form that `replay.replay` asks of a filter: poses of the modules'
-    rings.
+    `ShapeEstimator` in the form that `replay.replay` asks of a filter.
+
+    Poses are those of the modules' rings.
 
     The base is where the description says, exactly; strain and velocity are not estimated, and
     nan.
@@ -23,15 +24,15 @@ class ShapeReplay:
         self.estimator = ShapeEstimator(robot, settings)
         if self.estimator.module_names != robot.ring_names:
             raise SettingsError(
-                f"robot '{robot.name}': shape needs a Hall sensor on every ring, in the rings' order; "
-                f'rings: {", ".join(robot.ring_names)}; with Hall sensor: '
+                f"robot '{robot.name}': shape needs a Hall sensor on every ring, in the rings' "
+                f'order; rings: {", ".join(robot.ring_names)}; with Hall sensor: '
                 f'{", ".join(self.estimator.module_names) or "none"}'
             )
         self.robot, self.settings = robot, settings
 
     @property
     def counts(self) -> dict:
-        """What the estimator received and used."""
+        """Count what the estimator received and used."""
         return {'samples': dict(self.estimator.counts)}
 
     def process(self, measurement: Measurement) -> Estimate | None:
@@ -46,7 +47,7 @@ class ShapeReplay:
 
 
 def as_estimate(shape: ShapeEstimate, T_map_base: np.ndarray) -> Estimate:
-    """The shape as an `Estimate` of base and rings."""
+    """Give the shape as an `Estimate` of base and rings."""
     rings = 1 + len(shape.modules)
     unknown = np.full((rings, 6), np.nan)
     T_map_backbone = np.tile(np.eye(4), (len(shape.curve), 1, 1))

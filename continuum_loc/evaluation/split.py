@@ -21,7 +21,11 @@ class SplitError(ValueError):
 
 
 def hold_out(robot: str) -> Trial:
-    """The hold-out of a bundled robot. Raises SplitError for a robot that has none."""
+    """
+    Return the hold-out of a bundled robot.
+
+    Raises SplitError for a robot that has none.
+    """
     if robot not in HOLD_OUT:
         raise SplitError(
             f"robot '{robot}' has no hold-out of its own; give a bag and a map. "
@@ -31,13 +35,17 @@ def hold_out(robot: str) -> Trial:
 
 
 def is_hold_out(trial: Trial) -> bool:
-    """Whether the trial's scene and trajectory are those of its robot's hold-out, whatever the seed."""
+    """Whether the trial's scene and trajectory are its robot's hold-out, whatever the seed."""
     held = HOLD_OUT.get(trial.robot)
     return held is not None and (trial.scene, trial.trajectory) == (held.scene, held.trajectory)
 
 
 def require_unseen(trials: list[Trial]) -> None:
-    """Raises SplitError when a claim would rest on the scene and trajectory that the filter was tuned on."""
+    """
+    Raise SplitError where a claim would rest on what the filter was tuned on.
+
+    That is a scene with a trajectory.
+    """
     seen = sorted({trial.name for trial in trials if is_hold_out(trial)})
     if seen:
         raise SplitError(f'tuned on, so no claim may rest on it: {", ".join(seen)}')

@@ -59,17 +59,17 @@ class Claim:
 
 # A value that is not a number holds no bound: every comparison below is false for nan.
 def at_most(name: str, value: float, unit: str, limit: float) -> Claim:
-    """The claim value <= limit."""
+    """Claim value <= limit."""
     return Claim(name, float(value), unit, f'<= {limit:g}', bool(value <= limit))
 
 
 def at_least(name: str, value: float, unit: str, limit: float) -> Claim:
-    """The claim value >= limit."""
+    """Claim value >= limit."""
     return Claim(name, float(value), unit, f'>= {limit:g}', bool(value >= limit))
 
 
 def between(name: str, value: float, unit: str, low: float, high: float) -> Claim:
-    """The claim low <= value <= high."""
+    """Claim low <= value <= high."""
     return Claim(name, float(value), unit, f'{low:g} to {high:g}', bool(low <= value <= high))
 
 
@@ -86,7 +86,7 @@ def study_names() -> list[str]:
 
 def load_study(name: str) -> StudyRun:
     """
-    The `run` function of the study called `name`.
+    Find the `run` function of the study called `name`.
 
     Raises StudyError naming the nearest study.
     """
@@ -108,8 +108,9 @@ def write_study(
     extra: Mapping[str, Any] | None = None,
 ) -> Path:
     """
-    Write `out/summary.json` (claims, seed, versions, configuration) and each table as CSV, JSON,
-    Markdown and LaTeX.
+    Write `out/summary.json` and each table as CSV, JSON, Markdown and LaTeX.
+
+    The summary holds claims, seed, versions and configuration.
 
     settings: the configuration of the study: pydantic settings, a dataclass or plain mappings of
     them.
@@ -148,7 +149,11 @@ def versions() -> dict[str, str]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write strict JSON: arrays as lists, settings and dataclasses as mappings, not-finite numbers as null."""
+    """
+    Write strict JSON.
+
+    Arrays as lists, settings and dataclasses as mappings, not-finite numbers as null.
+    """
     Path(path).write_text(json.dumps(plain(content), indent=2, allow_nan=False) + '\n')
 
 

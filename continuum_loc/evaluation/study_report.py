@@ -1,4 +1,8 @@
-"""One self-contained HTML page about a campaign: its claims and tables, and its worst trial in full."""
+"""
+One self-contained HTML page about a campaign.
+
+Its claims and tables, and its worst trial in full.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +65,7 @@ def write_study_report(
 
 
 def with_worst_trial(page: Page, out: Path, ranked: Sequence[Outcome]) -> Page:
-    """The page, followed by everything that the report of the worst trial shows."""
+    """Make the page, followed by everything that the report of the worst trial shows."""
     if not ranked:
         return page
     run = load_run(out / 'trials' / ranked[0].trial.name)
@@ -73,7 +77,7 @@ def with_worst_trial(page: Page, out: Path, ranked: Sequence[Outcome]) -> Page:
 
 
 def claims_part(claims: Sequence[Claim]) -> Part:
-    """The claims, those that fail first."""
+    """Show the claims, those that fail first."""
     rows = [
         Row(
             [
@@ -93,7 +97,7 @@ def claims_part(claims: Sequence[Claim]) -> Part:
 
 
 def worst_part(ranked: Sequence[Outcome]) -> Part:
-    """The trials with the greatest mean error, the worst first."""
+    """Show the trials with the greatest mean error, the worst first."""
     rows = [
         Row(
             [

@@ -40,7 +40,7 @@ def write_table(table: pd.DataFrame | Sequence[Mapping[str, Any]], stem: Path) -
 
 
 def markdown(frame: pd.DataFrame) -> str:
-    """A GitHub table: text left, numbers right with four significant digits."""
+    """Write a GitHub table: text left, numbers right with four significant digits."""
     header = [str(name) for name in frame.columns]
     ruler = [
         '---:' if kind in 'iuf' else '---'
@@ -53,7 +53,7 @@ def markdown(frame: pd.DataFrame) -> str:
 
 
 def latex(frame: pd.DataFrame) -> str:
-    r"""A booktabs tabular, ready to be \\input."""
+    r"""Write a booktabs tabular, ready to be \\input."""
     columns = ''.join('r' if frame[name].dtype.kind in 'iuf' else 'l' for name in frame.columns)
     rows = [
         ' & '.join(cell.translate(LATEX_SPECIAL) for cell in line) + r' \\'

@@ -1,4 +1,8 @@
-"""Trajectories of a whole body: poses of the base and every ring over time, with TUM files and association to truth."""
+"""
+Trajectories of a whole body: poses of the base and every ring over time.
+
+With TUM files and association to truth.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +65,7 @@ class Track:
 
     @classmethod
     def from_estimates(cls, estimates: Iterable[Estimate], ring_names: Sequence[str]) -> Track:
-        """The last estimate made for each instant, in the order of the instants."""
+        """Keep the last estimate made for each instant, in the order of the instants."""
         latest = {estimate.stamp: estimate for estimate in estimates}
         ordered = [latest[stamp] for stamp in sorted(latest)]
         names = (BASE, *ring_names)
@@ -78,7 +82,7 @@ class Track:
 
     @classmethod
     def from_truth(cls, samples: Iterable[TruthSample], ring_names: Sequence[str]) -> Track:
-        """The recorded truth, in the order of its stamps (of doubled stamps the last)."""
+        """Take the recorded truth, in the order of its stamps (of doubled stamps the last)."""
         latest = {sample.stamp: sample.T_map_ring for sample in samples}
         names = (BASE, *ring_names)
         if not latest:
@@ -96,11 +100,11 @@ class Track:
 
     @classmethod
     def empty(cls, names: Sequence[str]) -> Track:
-        """A track without instants."""
+        """Make a track without instants."""
         return cls(np.empty(0, np.int64), tuple(names), np.empty((0, len(names), 4, 4)))
 
     def select(self, mask: np.ndarray) -> Track:
-        """The instants where `mask` (K,) is true."""
+        """Keep the instants where `mask` (K,) is true."""
 
         def pick(value: np.ndarray | None) -> np.ndarray | None:
             return None if value is None else value[mask]
@@ -116,8 +120,10 @@ class Track:
 
     def at(self, stamps: np.ndarray) -> np.ndarray:
         """
-        Poses (N, R + 1, 4, 4) at `stamps` (N,) inside the track, along the geodesic between its
-        neighbours: T(u) = T_a Exp(u Log(T_a^-1 T_b)). Raises TrackError for stamps outside.
+        Poses (N, R + 1, 4, 4) at `stamps` (N,) inside the track.
+
+        Along the geodesic between its neighbours: T(u) = T_a Exp(u Log(T_a^-1 T_b)). Raises
+        TrackError for stamps outside.
         """
         stamps = np.asarray(stamps, np.int64)
         if len(stamps) and (
@@ -136,7 +142,7 @@ class Track:
 
 def associate(estimate: Track, truth: Track, longest_gap: float = 0.2) -> tuple[Track, Track]:
     """
-    The estimate where truth is known, and the truth interpolated to the estimate's stamps.
+    Pair the estimate where truth is known with the truth interpolated to its stamps.
 
     Instants outside the truth, or inside a gap of it longer than `longest_gap` [s], are left out.
     """
@@ -151,7 +157,11 @@ def associate(estimate: Track, truth: Track, longest_gap: float = 0.2) -> tuple[
 
 
 def known_at(reference: np.ndarray, stamps: np.ndarray, longest_gap: float) -> np.ndarray:
-    """(K,) whether each stamp is one of `reference`'s, or lies between two of them at most `longest_gap` [s] apart."""
+    """
+    (K,) whether each stamp is one of `reference`'s, or lies between two of them.
+
+    Those two are at most `longest_gap` [s] apart.
+    """
     if len(reference) < 2:
         return np.zeros(len(stamps), bool)
     after = np.clip(np.searchsorted(reference, stamps, side='right'), 1, len(reference) - 1)
@@ -161,7 +171,11 @@ def known_at(reference: np.ndarray, stamps: np.ndarray, longest_gap: float) -> n
 
 
 def save_tum(track: Track, folder: str | Path, prefix: str) -> list[Path]:
-    """Write `folder/PREFIX_NAME.tum` for the base and each ring: lines `t x y z qx qy qz qw`, t in seconds to 1 ns."""
+    """
+    Write `folder/PREFIX_NAME.tum` for the base and each ring.
+
+    Lines `t x y z qx qy qz qw`, t in seconds to 1 ns.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     times = [

@@ -81,12 +81,12 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Unique among trials."""
+        """Name the trial, uniquely among trials."""
         return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
 
 
 def world(trial: Trial, faults: tuple = ()) -> World:
-    """The simulated world of a trial, at rest."""
+    """Make the simulated world of a trial, at rest."""
     from continuum_loc.simulator.scenes import load_scene
     from continuum_loc.simulator.world import World
 
@@ -107,7 +107,7 @@ def world(trial: Trial, faults: tuple = ()) -> World:
 def _disturbed(
     robot: RobotDescription, seed: int, faults: tuple
 ) -> tuple[RobotDescription, tuple]:
-    """The robot as it truly is, and its clocks."""
+    """Make the robot as it truly is, and its clocks."""
     from continuum_loc.simulator.faults import ClockOffset, miscalibrated
 
     biased = robot.model_copy(
@@ -120,7 +120,7 @@ def _disturbed(
 
 
 def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSample]:
-    """The samples of a trial, truth among them, in the order of their stamps."""
+    """Yield the samples of a trial, truth among them, in the order of their stamps."""
     return world(trial, faults).run(trial.duration)
 
 
@@ -136,7 +136,7 @@ def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> Replay
 
 
 def trial_settings(trial: Trial) -> EstimatorSettings:
-    """The settings for the robot with sensors of the trial's fidelity, where there are any, else the robot's."""
+    """Load the settings for the robot with sensors of the trial's fidelity, else the robot's."""
     from continuum_loc.estimator.settings import PRESETS_FOLDER, settings_of
 
     robot = load_robot(trial.robot).name
@@ -147,14 +147,14 @@ def trial_settings(trial: Trial) -> EstimatorSettings:
 def make_filter(
     robot: RobotDescription, prior_map: PriorMap | None, settings: EstimatorSettings | None = None
 ) -> Filter:
-    """The sliding-window filter, by default with the settings that come with the robot."""
+    """Make the sliding-window filter, by default with the settings that come with the robot."""
     from continuum_loc.estimator import settings_of, SlidingWindowFilter
 
     return SlidingWindowFilter(robot, prior_map, settings or settings_of(robot.name))
 
 
 def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:
-    """The prior map of a scene, sampled from its mesh once and kept on disk."""
+    """Return the prior map of a scene, sampled from its mesh once and kept on disk."""
     from continuum_loc.mapping.prior_map import load_map
 
     return load_map(scene_map_file(scene_name, points, seed))
@@ -162,7 +162,7 @@ def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -
 
 def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> Path:
     """
-    The file of `scene_map`.
+    Name the file of `scene_map`.
 
     Its name holds a digest of the mesh, so that a changed scene has a new map.
     """
@@ -190,7 +190,7 @@ def map_cache() -> Path:
 
 
 def topic_of(sample: Measurement | TruthSample) -> str:
-    """The topic of the contract that carries this sample."""
+    """Name the topic of the contract that carries this sample."""
     return (
         f'tracker/{sample.sensor}'
         if isinstance(sample, TrackedPose)

@@ -1,4 +1,8 @@
-"""Tune the filter on a hold-out bag: one number after another, by error and by consistency, as the papers did."""
+"""
+Tune the filter on a hold-out bag.
+
+One number after another, by error and by consistency, as the papers did.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +107,11 @@ def attempt(
 
 
 def cost(translation_m: float, rotation_deg: float, nees_per_dof: float) -> float:
-    """Mean of the logarithms of both errors, and how far the NEES is from 1 in either direction."""
+    """
+    Mean of the logarithms of both errors, and how far the NEES is from 1.
+
+    In either direction.
+    """
     values = np.array([translation_m, rotation_deg, nees_per_dof])
     if not np.all(values > 0.0):
         return math.inf
@@ -113,7 +121,7 @@ def cost(translation_m: float, rotation_deg: float, nees_per_dof: float) -> floa
 
 def scaled(settings: EstimatorSettings, name: str, factor: float) -> EstimatorSettings:
     """
-    `settings` with the number (or tuple of numbers) at the dotted `name` times `factor`.
+    Multiply the number (or tuple of numbers) at the dotted `name` of `settings` by `factor`.
 
     Raises SettingsError where the result is out of range, TuneError for a name that is none.
     """

@@ -1,4 +1,8 @@
-"""What the 3-D view and the moving picture show: the surroundings near the robot, and its body at chosen instants."""
+"""
+What the 3-D view and the moving picture show.
+
+The surroundings near the robot, and its body at chosen instants.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,11 @@ CLOUD_SPAN = (
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Mesh (vertices (V, 3), faces (F, 3)) and prior map points (P, 3) near the robot; either may be empty."""
+    """
+    Mesh and prior map points (P, 3) near the robot; either may be empty.
+
+    The mesh is vertices (V, 3) and faces (F, 3).
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -27,8 +35,10 @@ class Surroundings:
 @dataclass(frozen=True, eq=False)
 class Moment:
     """
-    The body at one instant: estimated and true backbone (B, 3), estimated rings (R, 3), recent ToF
-    points (M, 3). `truth` is empty where none was recorded.
+    The body at one instant.
+
+    Estimated and true backbone (B, 3), estimated rings (R, 3), recent ToF points (M, 3). `truth`
+    is empty where none was recorded.
     """
 
     stamp: int
@@ -42,8 +52,9 @@ def moments(
     result: ReplayResult, count: int, points: int, reach: float, extra: np.ndarray | None = None
 ) -> list[Moment]:
     """
-    At most `count` evenly spaced instants of the run and those in `extra` (stamps), each with at
-    most `points` ToF points of those in the `swept_box`.
+    At most `count` evenly spaced instants of the run and those in `extra` (stamps).
+
+    Each with at most `points` ToF points of those in the `swept_box`.
     """
     track = result.track
     if len(track) == 0:
@@ -68,7 +79,7 @@ def moments(
 
 
 def swept_box(result: ReplayResult, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,), (3,) of the box that reaches `reach` [m] beyond everything that the body swept."""
+    """Corners (3,), (3,) of the box that reaches `reach` [m] beyond all that the body swept."""
     track = result.track if len(result.track) else result.truth
     if len(track) == 0:
         return np.full(3, -np.inf), np.full(3, np.inf)
@@ -77,7 +88,11 @@ def swept_box(result: ReplayResult, reach: float) -> tuple[np.ndarray, np.ndarra
 
 
 def recent_points(cloud: Cloud, stamp: int, most: int) -> np.ndarray:
-    """Every n-th of the ToF points placed in the half second before `stamp`, so that at most `most` (M, 3) are left."""
+    """
+    Every n-th of the ToF points placed in the half second before `stamp`.
+
+    n leaves at most `most` (M, 3).
+    """
     recent = cloud.points[(cloud.stamps > stamp - CLOUD_SPAN) & (cloud.stamps <= stamp)]
     return recent[:: max(1, -(-len(recent) // most))]
 
@@ -90,7 +105,7 @@ def true_backbone(truth: Track, stamp: int) -> np.ndarray:
 
 
 def smooth_backbone(T_map_ring: np.ndarray) -> np.ndarray:
-    """(K, B, 3) cubic Hermite curve through poses (K, R + 1, 4, 4) along their tangents (body x)."""
+    """(K, B, 3) cubic Hermite curve through poses (K, R + 1, 4, 4) along their body x axes."""
     start, end = T_map_ring[:, :-1, None, :3], T_map_ring[:, 1:, None, :3]
     chord = np.linalg.norm(end[..., 3] - start[..., 3], axis=-1, keepdims=True)
     u = np.linspace(0.0, 1.0, POINTS_PER_SPAN)[None, None, :, None]
@@ -112,8 +127,9 @@ def surroundings(
     most_points: int,
 ) -> Surroundings:
     """
-    The part of the scene's mesh (vertices, faces) and of the prior map in the `swept_box`, thinned
-    to the given numbers.
+    Cut the part of the scene's mesh (vertices, faces) and of the prior map in the `swept_box`.
+
+    Both are thinned to the given numbers.
     """
     low, high = swept_box(result, reach)
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), int)
@@ -127,7 +143,7 @@ def surroundings(
 def clipped(
     vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh inside an axis-aligned box, its faces cut at the box's sides."""
+    """Clip the mesh to an axis-aligned box, its faces cut at the box's sides."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = np.array(vertices), np.array(faces)
@@ -141,7 +157,7 @@ def clipped(
 def thinned(
     vertices: np.ndarray, faces: np.ndarray, most_faces: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with at most about `most_faces` faces, by quadric decimation."""
+    """Thin the mesh to at most about `most_faces` faces, by quadric decimation."""
     import open3d as o3d
 
     mesh = o3d.geometry.TriangleMesh(

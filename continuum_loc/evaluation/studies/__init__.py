@@ -1,1 +1,5 @@
-"""The studies behind the figures that the README quotes: one module each, see `continuum_loc.evaluation.study`."""
+"""
+Studies behind the figures that the README quotes, one module each.
+
+See `continuum_loc.evaluation.study`.
+"""

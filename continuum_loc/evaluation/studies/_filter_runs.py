@@ -1,4 +1,8 @@
-"""Replays of simulated trials with the filter's settings changed, the recording cut, or faults put in."""
+"""
+Replays of simulated trials with something changed.
+
+The filter's settings changed, the recording cut, or faults put in.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +97,7 @@ class Witness:
 
     @property
     def counts(self) -> dict[str, Any]:
-        """What the filter counts."""
+        """Return what the filter counts."""
         return self.watched.counts
 
     def process(self, measurement: Measurement) -> Estimate | None:
@@ -117,7 +121,11 @@ class Witness:
 
 
 def run_cases(cases: Sequence[Case], out: Path, jobs: int) -> list[CaseResult]:
-    """Simulate the recordings and replay the cases that `out` does not hold yet; results in the order of `cases`."""
+    """
+    Simulate the recordings and replay the cases that `out` does not hold yet.
+
+    Results are in the order of `cases`.
+    """
     failed = record_bags([case.trial for case in cases], out, jobs)
     todo = [(out, case) for case in cases if case.trial.recording not in failed]
     problems = dict(show_progress(parallel(replay_case, todo, jobs), len(todo), 'estimating'))
@@ -177,7 +185,11 @@ def _digest(folder: Path) -> str | None:
 
 
 def case_settings(case: Case) -> EstimatorSettings:
-    """The settings that come with the robot, changed as the case says. Raises SettingsError."""
+    """
+    Return the settings that come with the robot, changed as the case says.
+
+    Raises SettingsError.
+    """
     data = load_estimator_settings(load_robot(case.trial.robot).name).model_dump()
     for section, value in case.changes.items():
         data[section] = {**data[section], **value} if isinstance(value, dict) else value
@@ -187,7 +199,7 @@ def case_settings(case: Case) -> EstimatorSettings:
 def case_samples(
     samples: Iterable[Measurement | TruthSample], case: Case
 ) -> Iterator[Measurement | TruthSample]:
-    """The part of a recording that the case wants, with its faults."""
+    """Cut out the part of a recording that the case wants, with its faults."""
     stream = cut(samples, case.start, case.end)
     for fault in case.faults:
         stream = fault(stream)
@@ -197,7 +209,7 @@ def case_samples(
 def cut(
     samples: Iterable[Measurement | TruthSample], start: float, end: float
 ) -> Iterator[Measurement | TruthSample]:
-    """The samples whose stamps lie in [start, end) seconds after the first one's."""
+    """Keep the samples whose stamps lie in [start, end) seconds after the first one's."""
     epoch = None
     for sample in samples:
         epoch = sample.stamp if epoch is None else epoch
@@ -233,15 +245,16 @@ def load_case(out: Path, case: Case, error: str = '') -> CaseResult:
 
 
 def longest_unannounced(result: CaseResult) -> float:
-    """The longest time [s] for which some ring is off although the filter says that it is tracking."""
+    """Find the longest time [s] for which a ring is off while the filter says it is tracking."""
     off = (result.found.translation_m[:, 1:] > OFF) & (result.status == 'tracking')[:, None]
     return max(longest_stretch(result.times, off[:, ring]) for ring in range(off.shape[1]))
 
 
 def longest_stretch(times: np.ndarray, flags: np.ndarray) -> float:
     """
-    The longest time [s] over which `flags` (K,) stay true at consecutive `times` (K,); each counts
-    until the next, the last one for the usual distance between them.
+    Find the longest time [s] over which `flags` (K,) stay true at consecutive `times` (K,).
+
+    Each counts until the next, the last one for the usual distance between them.
     """
     if not np.any(flags):
         return 0.0
@@ -252,7 +265,11 @@ def longest_stretch(times: np.ndarray, flags: np.ndarray) -> float:
 
 
 def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
-    """The first of `times` (K,) from which on `flags` (K,) stay true; inf where the last one is false."""
+    """
+    Find the first of `times` (K,) from which on `flags` (K,) stay true.
+
+    inf where the last one is false.
+    """
     wrong = np.flatnonzero(~flags)
     if len(wrong) == 0:
         return float(times[0])
@@ -260,7 +277,7 @@ def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
 
 
 def failures(results: Sequence[CaseResult]) -> dict[str, str]:
-    """The cases that gave nothing, and why."""
+    """List the cases that gave nothing, and why."""
     return {result.case.folder: result.error for result in results if result.run is None}
 
 

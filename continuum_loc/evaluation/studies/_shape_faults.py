@@ -1,4 +1,8 @@
-"""Faults of the Hall + IMU arm, one after the other: is each told for what it is, and how soon?"""
+"""
+Faults of the Hall + IMU arm, one after the other.
+
+Is each told for what it is, and how soon?
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,11 @@ STRAIGHT, ANYHOW = ShapeSettings(), ShapeSettings(start='anyhow')
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A fault: the word that has to be told, when it begins [s], the settings it is met with, and the samples."""
+    """
+    A fault.
+
+    The word that has to be told, when it begins [s], the settings it is met with, and the samples.
+    """
 
     name: str
     word: str
@@ -30,7 +38,11 @@ class Case:
 
 
 def fault_rows(robot: RobotDescription, seed: int) -> list[dict[str, Any]]:
-    """What a calibrated estimator says first in each case, how long after the fault began, and whether it is right."""
+    """
+    Tell what a calibrated estimator says first in each case, how late, and whether it is right.
+
+    Late: after the fault began.
+    """
     arm = Arm(robot, seed=seed)
     calibration = calibrate(robot, arm.calibration_rests())
     return [
@@ -114,7 +126,7 @@ def _cases(robot: RobotDescription, arm: Arm, seed: int) -> Iterator[Case]:
 def _later(
     samples: list[Sample], sensor: str, change: Callable[[Sample], Sample | None]
 ) -> list[Sample]:
-    """The samples, those of sensors beginning with `sensor` changed from `BEGIN` on; None drops one."""
+    """Change the samples of sensors beginning with `sensor` from `BEGIN` on; None drops one."""
     begin = samples[0].stamp
     changed = (
         change(s) if s.sensor.startswith(sensor) and seconds(s.stamp, begin) >= BEGIN else s

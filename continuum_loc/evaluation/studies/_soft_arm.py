@@ -1,4 +1,8 @@
-"""The trials of Tables III and IV: the soft arm in the box, every map with every scene that differs by one object."""
+"""
+Trials of Tables III and IV: the soft arm in the box.
+
+Every map with every scene that differs by one object.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,11 @@ FIDELITIES = ('paper', 'vl53l5cx')
 
 
 def soft_arm_trials(quick: bool, seed: int) -> list[Trial]:
-    """All 61 combinations in both fidelities (`quick`: four seconds of one trajectory, one pair of each kind)."""
+    """
+    All 61 combinations in both fidelities.
+
+    `quick`: four seconds of one trajectory, one pair of each kind.
+    """
     if quick:
         return [
             Trial(

@@ -1,4 +1,8 @@
-"""What each sensor and each part of the filter is worth on the engine robot, and cold starts without strain."""
+"""
+What each sensor and each part of the filter is worth on the engine robot.
+
+And cold starts without strain.
+"""
 
 from __future__ import annotations
 
@@ -60,21 +64,28 @@ FOUND = 0.02  # m: with every ring closer than this a cold start has found itsel
 UNANNOUNCED = 1.0  # s: the limit for a ring that is off without a word
 
 TEXT = """
-The paper says of its strain sensor alone that it "does not provide enough information for accurate localization,
-resulting in 'spatial drift'": bending is measured, position is its integral, so that the error grows from the base to
-the tip. The rows `without ToF` and `strain alone` of the first table show it ring by ring; {drift}.
+The paper says of its strain sensor alone that it "does not provide enough information for accurate
+localization, resulting in 'spatial drift'": bending is measured, position is its integral, so that
+the error grows from the base to the tip. The rows `without ToF` and `strain alone` of the first
+table show it ring by ring; {drift}.
 
-Of ToF without strain it says that its estimates "frequently converge to local minima", for which it had no cure. A
-filter that tracks from a known straight start seldom meets one; one that starts bent, with nothing known but its base,
-does. The table of cold starts shows each twice, with the search for another body switched off and on: {minima}.
+Of ToF without strain it says that its estimates "frequently converge to local minima", for which
+it had no cure. A filter that tracks from a known straight start seldom meets one; one that starts
+bent, with nothing known but its base, does. The table of cold starts shows each twice, with the
+search for another body switched off and on: {minima}.
 
-A ring counts as off beyond 5 cm, and *unannounced* is the longest time for which a ring is off while the filter says
-`tracking`. The window of `all sensors` is 1 s; the row `window 1 s` repeats it under its name.
+A ring counts as off beyond 5 cm, and *unannounced* is the longest time for which a ring is off
+while the filter says `tracking`. The window of `all sensors` is 1 s; the row `window 1 s` repeats
+it under its name.
 """.strip()
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Replay every variant over trials that no number was tuned on (`quick`: three over four seconds, one cold start)."""
+    """
+    Replay every variant over trials that no number was tuned on.
+
+    `quick`: three over four seconds, one cold start.
+    """
     cases = warm_cases(quick, seed) + cold_cases(quick, seed)
     require_unseen([case.trial for case in cases])
     results = run_cases(cases, out, jobs)
@@ -112,7 +123,11 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def warm_cases(quick: bool, seed: int) -> list[Case]:
-    """Every variant from the start of two trials, and those that bear on it in a scene that differs from its map."""
+    """
+    Every variant from the start of two trials.
+
+    And those that bear on it in a scene that differs from its map.
+    """
     if quick:
         return [
             Case(name, Trial(trajectory='t2', seed=seed, duration=6.0), VARIANTS[name], end=4.0)
@@ -128,7 +143,11 @@ def warm_cases(quick: bool, seed: int) -> list[Case]:
 
 
 def cold_cases(quick: bool, seed: int) -> list[Case]:
-    """Starts in the middle of a recording, where the robot is bent and moves: the base is all that is known."""
+    """
+    Start in the middle of a recording, where the robot is bent and moves.
+
+    The base is all that is known.
+    """
     if quick:
         return [
             Case('cold', Trial(trajectory='t2', seed=seed, duration=6.0), COLD['cold'], start=4.6)
@@ -143,7 +162,7 @@ def cold_cases(quick: bool, seed: int) -> list[Case]:
 
 
 def by_name(results: Sequence[CaseResult]) -> dict[str, list[CaseResult]]:
-    """The cases that gave a run, by variant."""
+    """Sort the cases that gave a run by variant."""
     found: dict[str, list[CaseResult]] = {}
     for result in results:
         if result.run is not None:
@@ -157,7 +176,7 @@ def as_mapped(result: CaseResult) -> bool:
 
 
 def judge(warm: Sequence[CaseResult], cold: Sequence[CaseResult]) -> list[Claim]:
-    """The bound for trials without strain, and the paper's two claims as figures."""
+    """Judge the bound for trials without strain; the paper's two claims are figures."""
     groups = by_name(warm) | by_name(cold)
     claims = [
         at_most(
@@ -277,7 +296,7 @@ def cold_row(result: CaseResult) -> dict[str, Any]:
 
 
 def drift(warm: Sequence[CaseResult]) -> str:
-    """The paper's first claim in figures."""
+    """Put the paper's first claim in figures."""
     groups = by_name(warm)
     if 'without ToF' not in groups or 'all sensors' not in groups:
         return 'no figures, as the trials failed'
@@ -292,7 +311,7 @@ def drift(warm: Sequence[CaseResult]) -> str:
 
 
 def minima(cold: Sequence[CaseResult]) -> str:
-    """The paper's second claim in figures."""
+    """Put the paper's second claim in figures."""
     told = []
     for name, members in by_name(cold).items():
         stuck = sum(found_after(result) == np.inf for result in members)

@@ -1,4 +1,8 @@
-"""Scene reconstruction and anomalies: what the trials of Table II saw, against the true meshes and known anomalies."""
+"""
+Scene reconstruction and anomalies, from what the trials of Table II saw.
+
+Against the true meshes and known anomalies.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +51,10 @@ APART = (
 @dataclass(frozen=True, eq=False)
 class SceneResult:
     """
-    What the trials of one scene gave: points, their RMSE to the true mesh (and that of points
-    placed by the true poses, which is the sensors' share), clusters, and what could be found.
+    What the trials of one scene gave.
+
+    Points, their RMSE to the true mesh (and that of points placed by the true poses, which is the
+    sensors' share), clusters, and what could be found.
     """
 
     scene: str
@@ -61,7 +67,11 @@ class SceneResult:
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Localise as for Table II (trials in `out` are not run again), then reconstruct each scene from its trials."""
+    """
+    Localise as for Table II, then reconstruct each scene from its trials.
+
+    Trials in `out` are not run again.
+    """
     (out / 'anomalies').mkdir(parents=True, exist_ok=True)
     outcomes = run_campaign(trials(quick, seed), out, jobs)
     scenes = list(dict.fromkeys(outcome.trial.scene for outcome in outcomes))
@@ -99,7 +109,11 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def judge_scene(out: Path, scene_name: str, members: list[Trial]) -> SceneResult:
-    """Reconstruct from the smoothed trajectories of a scene's trials, and detect what differs from the prior map."""
+    """
+    Reconstruct from the smoothed trajectories of a scene's trials.
+
+    Then detect what differs from the prior map.
+    """
     scene = load_scene(scene_name)
     estimated = joined(
         [reconstruction_of(out, trial, number, 'lagged') for number, trial in enumerate(members)]
@@ -129,7 +143,7 @@ def judge_scene(out: Path, scene_name: str, members: list[Trial]) -> SceneResult
 
 
 def reconstruction_of(out: Path, trial: Trial, number: int, track: str) -> Reconstruction:
-    """The points of one trial, by its smoothed estimate (`lagged`) or by the true poses (`truth`)."""
+    """Place the points of one trial, by its smoothed estimate (`lagged`) or by the `truth`."""
     run = load_run(out / 'trials' / trial.name)
     path: Track = getattr(run.result, track)
     frames = [sample for sample in samples_of(bag_of(out, trial)) if isinstance(sample, TofFrame)]
@@ -180,7 +194,7 @@ def pooled_curve(results: list[SceneResult]) -> list[dict[str, Any]]:
 def judge(
     outcomes: list[Outcome], results: list[SceneResult], curve: list[dict[str, Any]]
 ) -> list[Claim]:
-    """RMSE of the worst scene, and the best recall that is reached at a precision of at least 0.9."""
+    """RMSE of the worst scene, and the best recall reached at a precision of at least 0.9."""
     precise = [point['recall'] for point in curve if point['precision'] >= 0.9]
     return [
         at_most(

@@ -1,4 +1,8 @@
-"""Whether the filter's covariances are honest: NEES and coverage, by ring, by component and by how fast it moves."""
+"""
+Whether the filter's covariances are honest.
+
+NEES and coverage, by ring, by component and by how fast it moves.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +29,21 @@ SPEEDS = (0.0, 0.05, 0.2, np.inf)  # rad/s
 SPAN = 50_000_000  # ns over which a ring's true speed is taken
 
 TEXT = """
-The pose error of a ring is xi = Log(T_est^-1 T_true), with the covariance P that the filter states for it. An honest
-filter has a NEES of xi^T P^-1 xi / 6 near 1, and 95 % of its errors inside the 95 % ellipsoid. A NEES above 1 means
-that the filter believes itself too much, below 1 too little. The table of components says where: each number is the
-root mean square of an error over its own sigma. The table of speeds says when: a prior of white noise on acceleration
-is too loose for a robot that holds still, and too tight for one that jerks; so is a cubic between two knots.
+The pose error of a ring is xi = Log(T_est^-1 T_true), with the covariance P that the filter states
+for it. An honest filter has a NEES of xi^T P^-1 xi / 6 near 1, and 95 % of its errors inside the
+95 % ellipsoid. A NEES above 1 means that the filter believes itself too much, below 1 too little.
+The table of components says where: each number is the root mean square of an error over its own
+sigma. The table of speeds says when: a prior of white noise on acceleration is too loose for a
+robot that holds still, and too tight for one that jerks; so is a cubic between two knots.
 """.strip()
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Track trials that no number was tuned on (`quick`: six seconds of one), and judge every ring."""
+    """
+    Track trials that no number was tuned on, and judge every ring.
+
+    `quick`: six seconds of one.
+    """
     wanted = trials(quick, seed)
     require_unseen(wanted)
     outcomes = run_campaign(wanted, out, jobs)
@@ -89,7 +98,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def trials(quick: bool, seed: int) -> list[Trial]:
-    """Engine trials in the mapped scene and in one that differs from its map, and the soft arm's."""
+    """Engine trials in the mapped scene and in one that differs, and the soft arm's."""
     if quick:
         return [Trial('engine', 'S0', 't2', seed=seed, duration=6.0)]
     return [
@@ -102,7 +111,7 @@ def trials(quick: bool, seed: int) -> list[Trial]:
 
 
 def judge(robot: str, found: Errors) -> list[Claim]:
-    """The bounds, over all rings and for each."""
+    """Judge the bounds, over all rings and for each."""
     claims = []
     for name, ring in columns(found):
         known = honesty(found, ring)
@@ -166,7 +175,7 @@ def speed_rows(robot: str, found: Errors, speed: np.ndarray) -> list[dict[str, A
 
 
 def pooled(out: Path, members: Sequence[Trial]) -> tuple[Errors, np.ndarray]:
-    """The errors of several trials one after another, and the true speed of turning (K, R + 1) [rad/s]."""
+    """Chain the errors of several trials, and the true speed of turning (K, R + 1) [rad/s]."""
     parts, speeds = [], []
     for trial in members:
         result = load_run(out / 'trials' / trial.name).result

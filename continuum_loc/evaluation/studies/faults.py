@@ -1,6 +1,7 @@
 """
-Faults put into recordings: how far the filter is led astray, how soon it is back, and whether it
-names the culprit.
+Faults put into recordings.
+
+How far the filter is led astray, how soon it is back, and whether it names the culprit.
 
 A fault lasts from START for LENGTH seconds. Each case is judged beside the same trial without it:
 *normal* is the largest error of that clean run over the same time, with a margin of a quarter.
@@ -42,8 +43,10 @@ CLEAN = 'no fault'
 @dataclass(frozen=True, kw_only=True)
 class Turned(Fault):
     """
-    A ToF sensor knocked out of its mount: its points belong `angle_deg` away, about its z axis,
-    from where the robot description puts them.
+    A ToF sensor knocked out of its mount.
+
+    Its points belong `angle_deg` away, about its z axis, from where the robot description puts
+    them.
     """
 
     angle_deg: float = 20.0
@@ -65,7 +68,7 @@ class Injected:
     options: tuple[tuple[str, float], ...] = ()
 
     def at(self, start: float) -> Fault:
-        """The fault as it strikes from `start` on."""
+        """Make the fault as it strikes from `start` on."""
         return self.kind(
             sensors=self.sensors, start=start, end=start + LENGTH, **dict(self.options)
         )
@@ -85,18 +88,23 @@ QUICK = ('ToF sensor stuck', 'sensor turned by 20 deg')
 EVERYBODY = ('*',)  # a fault of all sensors has no culprit to be told from the rest
 
 TEXT = """
-Each fault lasts 2 s. *During* is the largest error of any ring while it lasts, beside the same trial without it;
-*back after* the time after its end from which on no ring is farther off than normal (a quarter above the clean run's
-largest error). *Named* is the share of the culprits that the diagnostics name while the fault lasts or within a second
-of its end: a sensor is named when it is among `suspects`, or when it is missing from `inliers`, the shares of fitting
-samples of the sensors that the window has heard. *Accused* are other sensors among the suspects. Whom the clean run
-names over the same time does not count for either; that has a table and a claim of its own, beside the least share
-of fitting samples of each kind of sensor.
+Each fault lasts 2 s. *During* is the largest error of any ring while it lasts, beside the same
+trial without it; *back after* the time after its end from which on no ring is farther off than
+normal (a quarter above the clean run's largest error). *Named* is the share of the culprits that
+the diagnostics name while the fault lasts or within a second of its end: a sensor is named when it
+is among `suspects`, or when it is missing from `inliers`, the shares of fitting samples of the
+sensors that the window has heard. *Accused* are other sensors among the suspects. Whom the clean
+run names over the same time does not count for either; that has a table and a claim of its own,
+beside the least share of fitting samples of each kind of sensor.
 """.strip()
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Inject every fault into trials that no number was tuned on (`quick`: two faults in one short trial)."""
+    """
+    Inject every fault into trials that no number was tuned on.
+
+    `quick`: two faults in one short trial.
+    """
     cases = fault_cases(quick, seed)
     require_unseen([case.trial for case in cases])
     results = run_cases(cases, out, jobs)
@@ -126,7 +134,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def fault_cases(quick: bool, seed: int) -> list[Case]:
-    """The clean run and every fault, in each trial."""
+    """List the clean run and every fault, in each trial."""
     start = QUICK_START if quick else START
     trials = (
         [Trial(trajectory='t2', seed=seed, duration=6.0)]
@@ -146,7 +154,7 @@ def fault_cases(quick: bool, seed: int) -> list[Case]:
 
 
 def fault_row(result: CaseResult, clean: CaseResult) -> dict[str, Any]:
-    """What a fault did."""
+    """Tell what a fault did."""
     fault = result.case.faults[0]
     normal = NORMAL_MARGIN * float(clean.worst_ring[clean.times >= fault.start].max())
     during = (result.times >= fault.start) & (result.times < fault.end)
@@ -183,7 +191,7 @@ def diagnosis(result: CaseResult, clean: CaseResult) -> dict[str, Any]:
 
 
 def clean_row(result: CaseResult) -> dict[str, Any]:
-    """A run without a fault: who is accused in it, and how well the worst sensor of each kind fits."""
+    """Tell who is accused in a run without a fault, and each kind's least fitting share."""
     blamed = set().union(*result.accused)
     least = {
         kind: min(
@@ -232,7 +240,7 @@ def judge(rows: Sequence[dict[str, Any]], failed: int) -> list[Claim]:
 
 
 def struck(fault: Fault) -> set[str]:
-    """The engine's ToF sensors and gyros that a fault strikes."""
+    """Find the engine's ToF sensors and gyros that a fault strikes."""
     robot = load_robot('engine')
     return {
         sensor.name
@@ -242,7 +250,7 @@ def struck(fault: Fault) -> set[str]:
 
 
 def noticed(result: CaseResult, fault: Fault) -> np.ndarray:
-    """Steps at which a diagnosis can be due to the fault."""
+    """Find the steps at which a diagnosis can be due to the fault."""
     return np.flatnonzero((result.steps >= fault.start) & (result.steps < fault.end + BACK))
 
 
@@ -252,7 +260,11 @@ def accused(result: CaseResult, fault: Fault) -> set[str]:
 
 
 def named_at(result: CaseResult, fault: Fault, name: str) -> float:
-    """Time [s] from the fault's start until `name` is suspected or no longer heard; inf where it never is."""
+    """
+    Time [s] from the fault's start until `name` is suspected or no longer heard.
+
+    inf where it never is.
+    """
     steps = [
         step
         for step in noticed(result, fault)

@@ -1,6 +1,7 @@
 """
-Recorded trials of a real tendon-driven robot, beside the published C++ sliding-window filter and
-Hermite curves.
+Recorded trials of a real tendon-driven robot.
+
+Beside the published C++ sliding-window filter and Hermite curves.
 
 The trials are found through the environment variable CONTINUUM_LOC_DATA: a folder that holds
 `slow_free_space` and `impulse_2`. Motion capture is the truth and never an input. Errors are taken
@@ -53,7 +54,11 @@ STEP_MS = 5.0
 
 @dataclass(frozen=True, eq=False)
 class DiscErrors:
-    """Errors of one disc at K stamps: translation (K,) [m], rotation (K,) [deg], nees (K,) of 6 degrees of freedom."""
+    """
+    Errors of one disc at K stamps.
+
+    Translation (K,) [m], rotation (K,) [deg], nees (K,) of 6 degrees of freedom.
+    """
 
     translation: np.ndarray
     rotation: np.ndarray
@@ -61,7 +66,11 @@ class DiscErrors:
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Both trials whole (`quick`: impulse_2 alone, from 5 s to the window's end), all at one tuning."""
+    """
+    Both trials whole, all at one tuning.
+
+    `quick`: impulse_2 alone, from 5 s to the window's end.
+    """
     folder, robot, settings = data_folder(), load_robot(ROBOT), load_estimator_settings(ROBOT)
     claims, rows, times = [], [], []
     for trial in ('impulse_2',) if quick else WINDOWS:
@@ -94,7 +103,11 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def data_folder() -> Path:
-    """The folder of the trials. Raises StudyError saying how to name it."""
+    """
+    Find the folder of the trials.
+
+    Raises StudyError saying how to name it.
+    """
     named = os.environ.get(DATA)
     if not named:
         raise StudyError(
@@ -115,7 +128,11 @@ def estimates(
     estimator: SlidingWindowFilter,
     span: tuple[float, float] = (-np.inf, np.inf),
 ) -> tuple[list[Estimate], list[Estimate], list[float]]:
-    """Newest and lagged estimates of the measurements in `span` [s of the trial], and the time of each step [ms]."""
+    """
+    Newest and lagged estimates of the measurements in `span`, and the time of each step [ms].
+
+    `span` is in seconds of the trial.
+    """
     newest, lagged, step_ms = [], [], []
     for sample in recording.measurements:
         if not span[0] <= (sample.stamp - STAMP_OF_ZERO) * 1e-9 <= span[1]:
@@ -135,7 +152,11 @@ def disc_errors(
     robot: RobotDescription,
     window: tuple[float, float],
 ) -> dict[str, DiscErrors]:
-    """Errors by disc at the stamps of motion capture in `window` [s]; covariances are those of the next estimate."""
+    """
+    Errors by disc at the stamps of motion capture in `window` [s].
+
+    Covariances are those of the next estimate.
+    """
     ordered = sorted(
         {estimate.stamp: estimate for estimate in made}.values(),
         key=lambda estimate: estimate.stamp,
@@ -185,9 +206,9 @@ def hermite_errors(
     recording: Recording, robot: RobotDescription, window: tuple[float, float]
 ) -> dict[str, np.ndarray]:
     """
-    Translation errors (K,) [m] by disc of the cubic curve from base to tip whose end tangents are
-    as long as the
-    backbone: the peer that needs no filter.
+    Compute translation errors (K,) [m] by disc of the cubic curve from base to tip.
+
+    Its end tangents are as long as the backbone: the peer that needs no filter.
     """
     base, tip = (_tracked(recording, tracker.name) for tracker in robot.trackers)
     found = {}
@@ -226,7 +247,11 @@ def _interpolated(tracked: tuple[np.ndarray, np.ndarray], at: np.ndarray) -> np.
 
 
 def _row(trial: str, kind: str, disc: str, found: DiscErrors, hermite: np.ndarray) -> dict:
-    """One line of the table: ours, the C++ code's and Hermite's RMSE [mm], and how honest our covariance is."""
+    """
+    One line of the table.
+
+    Ours, the C++ code's and Hermite's RMSE [mm], and how honest our covariance is.
+    """
     return {
         'trial': trial,
         'state': kind,
@@ -246,7 +271,11 @@ def _rms(values: np.ndarray) -> float:
 
 
 def judge(rows: list[dict]) -> list[Claim]:
-    """Every disc's RMSE is no more than the C++ code's, nor than Hermite's; the latter are also what was published."""
+    """
+    Every disc's RMSE is no more than the C++ code's, nor than Hermite's.
+
+    The latter are also what was published.
+    """
     claims = []
     for row in rows:
         name = f'{row["trial"]}, {row["disc"]}, {row["state"]}'

@@ -1,4 +1,8 @@
-"""Shape from Hall sensors and IMUs: the paper's grooves, its own pipeline as printed, free bending, faults, speed."""
+"""
+Shape from Hall sensors and IMUs.
+
+The paper's grooves, its own pipeline as printed, free bending, faults, speed.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +31,7 @@ from continuum_loc.shape.simulate import (
 )
 import numpy as np
 
-SPAN = 0.075  # m, from the magnet to the last module: the part of the robot that the paper's curves cover
+SPAN = 0.075  # m, from the magnet to the last module: what the paper's curves cover of the robot
 SAMPLES = 301  # points along a curve: the polyline's own error stays below a tenth of a micrometre
 FRACTIONS = np.linspace(0.0, 1.0, 151)
 METHODS: tuple[curves.CurveMethod, ...] = ('quadratic_bezier', 'cubic_bezier', 'kasa_arc')
@@ -85,7 +89,11 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def _groove_rows(seed: int) -> list[Row]:
-    """One arm in the three grooves: with calibration, tared only, uncorrected, and the paper's pipeline."""
+    """
+    One arm in the three grooves.
+
+    With calibration, tared only, uncorrected, and the paper's pipeline.
+    """
     robot = load_robot('hall_arm')
     arm = Arm(robot, seed=seed)
     calibration, background = calibrate(robot, arm.calibration_rests()), _background(arm)
@@ -168,7 +176,11 @@ def _printed_rows(seed: int) -> list[Row]:
 
 
 def _free_rows(seed: int) -> list[Row]:
-    """One calibrated arm in an arc, an S and a bend that turns out of its plane, both forms of every curve."""
+    """
+    One calibrated arm in an arc, an S and a bend that turns out of its plane.
+
+    Both forms of every curve.
+    """
     robot = load_robot('hall_arm')
     arm = Arm(robot, seed=seed)
     calibration = calibrate(robot, arm.calibration_rests())
@@ -207,7 +219,7 @@ def _both_forms(
 
 
 def _simulated_rows(robot: RobotDescription, seed: int, quick: bool) -> list[Row]:
-    """Free bending of the MuJoCo arm, moving: tendons against gravity, tared at its initial rest."""
+    """Bend the MuJoCo arm freely, moving: tendons against gravity, tared at its initial rest."""
     from continuum_loc.simulator.world import World
 
     rows = []
@@ -242,7 +254,11 @@ def _per_arm(experiment: Callable[[int], list[Row]], seeds: Sequence[int], jobs:
 
 
 def _background(arm: Arm) -> Background:
-    """The paper clears its background before the experiment: Hall without the magnet, IMU at rest."""
+    """
+    Clear the background before the experiment, as the paper does.
+
+    Hall without the magnet, IMU at rest.
+    """
     magnet, rest = arm.magnet, arm.taring_rest().rest
     arm.magnet = magnet.model_copy(update={'remanence': 0.0})
     without = arm.taring_rest().rest
@@ -318,7 +334,11 @@ def figure_data(robot: RobotDescription, seed: int) -> dict[str, dict[str, Any]]
 
 
 def _time_one_estimate(robot: RobotDescription, seed: int) -> float:
-    """Median time [ms] of everything an estimate costs: six samples of three modules, and the estimate itself."""
+    """
+    Median time [ms] of everything an estimate costs.
+
+    Six samples of three modules, and the estimate itself.
+    """
     arm = Arm(robot, seed=seed)
     estimator = ShapeEstimator(robot, ShapeSettings(rate=robot.imu_model.rate))
     spent, times = 0.0, []

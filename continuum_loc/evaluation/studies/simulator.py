@@ -43,7 +43,11 @@ TINY = 1e-12
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Claims of the study, with tables of statics, shapes, vibration, noise and motion under `out`."""
+    """
+    Claims of the study, with tables under `out`.
+
+    Tables of statics, shapes, vibration, noise and motion.
+    """
     statics = [*_statics((12, 24, 50) if quick else (6, 12, 24, 50, 100, 150))]
     shapes = [*_shapes(3 if quick else 20, seed)]
     vibration = [first_mode(24, step) for step in (0.002, 0.005)]
@@ -86,7 +90,11 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def settled_tip(model: Any, force: np.ndarray, moment: np.ndarray) -> np.ndarray:
-    """(4, 4) pose of a `uniform_rod`'s tip at rest under an end force [N] and moment [N m], map frame."""
+    """
+    (4, 4) pose of a `uniform_rod`'s tip at rest under an end force [N] and moment [N m].
+
+    In the map frame.
+    """
     import mujoco
 
     data = mujoco.MjData(model)
@@ -150,7 +158,11 @@ def _statics_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
 
 
 def _shapes(cases: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Tip errors against the Cosserat rod under random loads that bend the rod by some tens of degrees."""
+    """
+    Tip errors against the Cosserat rod under random loads.
+
+    They bend the rod by some tens of degrees.
+    """
     rng = np.random.default_rng(seed)
     for name, (stiffness, mass) in RODS.items():
         model = uniform_rod(COSSERAT_LINKS, ROD_LENGTH, stiffness, mass)
@@ -190,7 +202,11 @@ def _shape_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
 
 
 def first_mode(links: int, time_step: float, duration: float = 8.0) -> dict[str, float]:
-    """Frequency and damping of a weightless rod without damping of its own, let go from a small static bend."""
+    """
+    Frequency and damping of a weightless rod without damping of its own.
+
+    It is let go from a small static bend.
+    """
     model = uniform_rod(links, LENGTH, EI, MASS, supported=True, time_step=time_step)
     frequency, damping = _ring_down(_released(model, duration), time_step)
     expected = first_frequency(EI, MASS, LENGTH)
@@ -205,7 +221,11 @@ def first_mode(links: int, time_step: float, duration: float = 8.0) -> dict[str,
 
 
 def _released(model: Any, duration: float) -> np.ndarray:
-    """The tip's y [m] at every step after the load is gone; what damping remains is the integrator's."""
+    """
+    Record the tip's y [m] at every step after the load is gone.
+
+    What damping remains is the integrator's.
+    """
     import mujoco
 
     data = mujoco.MjData(model)
@@ -221,7 +241,11 @@ def _released(model: Any, duration: float) -> np.ndarray:
 
 
 def _ring_down(y: np.ndarray, time_step: float) -> tuple[float, float]:
-    """Frequency [Hz] from the rising zero crossings, damping ratio from the decrement of the peaks between them."""
+    """
+    Frequency [Hz] from the rising zero crossings, damping ratio from the decrement.
+
+    The decrement is that of the peaks between the crossings.
+    """
     rising = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
     crossings = time_step * (rising - y[rising] / (y[rising + 1] - y[rising]))
     peaks = np.array([y[a:b].max() for a, b in zip(rising, rising[1:], strict=False)])
@@ -247,7 +271,11 @@ def _vibration_claims(rows: list[dict[str, float]]) -> Iterator[Claim]:
 
 
 def _noise(seed: int) -> Iterator[dict[str, Any]]:
-    """Kolmogorov-Smirnov p-value of each sensor's error at rest over its model's sigma, against the normal law."""
+    """
+    Kolmogorov-Smirnov p-value of each sensor's error at rest over its model's sigma.
+
+    Against the normal law.
+    """
     from scipy import stats
 
     for sensor, z in _normalised_errors(seed):
@@ -289,7 +317,7 @@ def _resting(robot: RobotDescription, seed: int) -> list[Any]:
 
 
 def _quiet(robot: RobotDescription) -> RobotDescription:
-    """The robot with sensors that read the truth; biases stay, being drawn from the same stream."""
+    """Give the robot sensors that read the truth; biases stay, drawn from the same stream."""
     imu = robot.imu_model.model_copy(update={'gyro_sigma': TINY, 'accel_sigma': TINY})
     strain = robot.strain and robot.strain.model_copy(
         update={'kappa_sigma': TINY, 'theta_sigma': TINY}
@@ -335,7 +363,11 @@ def _tof_errors(robot: RobotDescription, seed: int) -> np.ndarray:
 
 
 def _consistency(trajectory: str, duration: float) -> dict[str, Any]:
-    """Root mean square of the gyros' departure from the chords of the true rotation, in per cent of the motion's."""
+    """
+    Root mean square of the gyros' departure from the chords of the true rotation.
+
+    In per cent of the motion's.
+    """
     robot = _quiet(load_robot('engine'))
     samples = list(World(robot, None, trajectory).run(duration))
     truth = np.array([s.T_map_ring for s in samples if type(s) is TruthSample])
@@ -397,7 +429,11 @@ def _motion_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
 
 
 def real_time_factor(duration: float, seed: int = 0, fidelity: str = 'vl53l5cx') -> float:
-    """Simulated seconds per second of processor time: the live engine robot on t1 in S0, contacts and all sensors."""
+    """
+    Run the live engine robot: its simulated seconds per second of processor time.
+
+    On t1 in S0, with contacts and all sensors.
+    """
     from continuum_loc.simulator.scenes import load_scene
 
     world = World(load_robot('engine'), load_scene('S0'), 't1', tof_fidelity=fidelity, seed=seed)

@@ -1,4 +1,8 @@
-"""Table II of the localisation paper: the engine, scenes S0-S9 with three trajectories each, S0 as the prior map."""
+"""
+Table II of the localisation paper: the engine, S0 as the prior map.
+
+Scenes S0-S9 with three trajectories each.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,11 @@ PAPER = {
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Run all trials (`quick`: six seconds of one trajectory in two scenes, with coarser links) and judge them."""
+    """
+    Run all trials and judge them.
+
+    `quick`: six seconds of one trajectory in two scenes, with coarser links.
+    """
     outcomes = run_campaign(trials(quick, seed), out, jobs)
     claims = judge(outcomes)
     tables = {
@@ -71,7 +79,7 @@ def trials(quick: bool, seed: int) -> list[Trial]:
 
 
 def judge(outcomes: list[Outcome]) -> list[Claim]:
-    """The bounds, over every trial but the hold-out that the filter was tuned on."""
+    """Judge the bounds, over every trial but the hold-out that the filter was tuned on."""
     judged = [outcome for outcome in outcomes if not is_hold_out(outcome.trial)]
     require_unseen([outcome.trial for outcome in judged])
     by_scene = {

@@ -1,4 +1,8 @@
-"""Table III of the localisation paper: the soft arm in the box, map and scene equal or one object apart."""
+"""
+Table III of the localisation paper: the soft arm in the box.
+
+Map and scene are equal or one object apart.
+"""
 
 from __future__ import annotations
 
@@ -76,17 +80,17 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def row_name(outcome: Outcome) -> str:
-    """The row of the table that a trial belongs to."""
+    """Name the row of the table that a trial belongs to."""
     return ' - '.join(pair(outcome.trial))
 
 
 def of_fidelity(outcomes: list[Outcome], fidelity: str) -> list[Outcome]:
-    """The trials of one sensor fidelity."""
+    """Keep the trials of one sensor fidelity."""
     return [outcome for outcome in outcomes if outcome.trial.fidelity == fidelity]
 
 
 def judge(outcomes: list[Outcome]) -> list[Claim]:
-    """The bounds, without the hold-out that the filter was tuned on."""
+    """Judge the bounds, without the hold-out that the filter was tuned on."""
     judged = [outcome for outcome in outcomes if not is_hold_out(outcome.trial)]
     require_unseen([outcome.trial for outcome in judged])
     claims = []

@@ -1,4 +1,8 @@
-"""Table IV of the localisation paper: the soft arm's rings one by one, pooled over all conditions of Table III."""
+"""
+Table IV of the localisation paper: the soft arm's rings one by one.
+
+Pooled over all conditions of Table III.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ PAPER = (
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """The trials of Table III (those in `out` already are not run again), by ring."""
+    """Run the trials of Table III (those in `out` already are not run again), by ring."""
     outcomes = run_campaign(soft_arm_trials(quick, seed), out, jobs)
     claims, tables = [], {}
     for fidelity in FIDELITIES:
