@@ -1,6 +1,7 @@
 """
-Scenes R0-R4: the inside of a 70 x 70 x 60 cm box in which the soft arm hangs, with none to four
-objects.
+Scenes R0-R4: the inside of a 70 x 70 x 60 cm box in which the soft arm hangs.
+
+There are none to four objects in it.
 
 The floor is z = 0, the arm comes through a hole in the middle of the ceiling. Objects stand round
 its working space.
@@ -62,7 +63,11 @@ def _slabs() -> list[Manifold]:
 
 
 def _mustard() -> Part:
-    """A squeeze bottle, 6 x 10 x 19 cm: an oval body that narrows to a shoulder, and a round cap."""
+    """
+    Make a squeeze bottle, 6 x 10 x 19 cm.
+
+    An oval body that narrows to a shoulder, and a round cap.
+    """
     heights = np.array([0.0, 0.008, 0.05, 0.10, 0.125, 0.145, 0.155])
     half_width = np.array([0.042, 0.047, 0.048, 0.047, 0.042, 0.026, 0.016])
     half_depth = np.array([0.024, 0.029, 0.030, 0.029, 0.026, 0.020, 0.016])
@@ -72,7 +77,7 @@ def _mustard() -> Part:
 
 
 def _cup() -> Part:
-    """A cup, 8 cm across and high, open at the top, with a handle."""
+    """Make a cup, 8 cm across and high, open at the top, with a handle."""
     bore = Manifold.cylinder(0.08, 0.034, 0.036, 48).translate((0.0, 0.0, 0.005))
     bowl = Manifold.cylinder(0.08, 0.036, 0.040, 48) - bore
     ring = CrossSection.circle(0.006, 16).translate((0.024, 0.0)).revolve(32)
@@ -85,13 +90,17 @@ def _cup() -> Part:
 
 
 def _cracker_box() -> Part:
-    """A carton, 6 x 16 x 21 cm."""
+    """Make a carton, 6 x 16 x 21 cm."""
     carton = box((0.06, 0.16, 0.21)).translate((0.0, 0.0, 0.105))
     return _standing('cracker_box', [carton], (0.25, -0.19), turn_deg=-30.0, reflectance=0.6)
 
 
 def _sign() -> Part:
-    """A folded wet-floor sign, 40 cm high: two boards that lean on one another, with a grip on top."""
+    """
+    Make a folded wet-floor sign, 40 cm high.
+
+    Two boards that lean on one another, with a grip on top.
+    """
     height, spread, lean = 0.38, 0.20, np.degrees(np.arctan2(0.095, 0.38))
     board = box((0.006, 0.20, height / np.cos(np.radians(lean)))).rotate((0.0, lean, 0.0))
     left = board.translate((-spread / 4, 0.0, height / 2))
@@ -106,7 +115,7 @@ _OBJECTS: tuple[Callable[[], Part], ...] = (_mustard, _cup, _cracker_box, _sign)
 def _standing(
     name: str, pieces: list[Manifold], xy: tuple[float, float], turn_deg: float, reflectance: float
 ) -> Part:
-    """A part of convex pieces, standing on the floor at `xy`."""
+    """Make a part of convex pieces, standing on the floor at `xy`."""
     hulls = tuple(vertices_of(piece) for piece in pieces)
     return _place(Part(name, sum(pieces[1:], pieces[0]), hulls, reflectance), xy, turn_deg)
 

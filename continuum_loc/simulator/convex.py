@@ -56,7 +56,11 @@ def convex_pieces(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[
 
 
 def _run(module: str, *arguments: object) -> subprocess.CompletedProcess:
-    """Run a module of this package, also where the package is not installed but on the caller's path."""
+    """
+    Run a module of this package.
+
+    Also where the package is not installed but on the caller's path.
+    """
     search = os.pathsep.join(
         [str(Path(__file__).parents[2]), os.environ.get('PYTHONPATH', '')]
     ).rstrip(os.pathsep)

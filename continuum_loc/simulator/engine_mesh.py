@@ -57,7 +57,11 @@ def casing_radius(x: float | np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BladeRow:
-    """A row of identical blades, twisted as tan(stagger) proportional to radius (rotors) or constant (vanes)."""
+    """
+    A row of identical blades.
+
+    They are twisted as tan(stagger) proportional to radius (rotors) or constant (vanes).
+    """
 
     name: str
     count: int
@@ -110,7 +114,11 @@ class BladeRow:
 
 
 def _gap_at_top(count: int) -> float:
-    """Azimuth [deg] of the first blade that leaves a gap centred on azimuth 0, the robot's way in."""
+    """
+    Azimuth [deg] of the first blade that leaves a gap centred on azimuth 0.
+
+    The gap is the robot's way in.
+    """
     return 180.0 / count
 
 
@@ -131,7 +139,11 @@ def engine_parts() -> list[Part]:
 
 
 def leading_edge(blade: str, radius: float) -> np.ndarray:
-    """(3,) point on the leading edge of a blade (`rotor1_0`) at a distance [m] from the engine's axis."""
+    """
+    (3,) point on the leading edge of a blade (`rotor1_0`).
+
+    At a distance [m] from the engine's axis.
+    """
     sections = _find_row(blade).sections(_index(blade))
     edge = 0.5 * (sections[:, 0] + sections[:, -1])
     radii = np.hypot(edge[:, 1], edge[:, 2])
@@ -140,8 +152,9 @@ def leading_edge(blade: str, radius: float) -> np.ndarray:
 
 def bitten(blade: Part, radius: float, size: float) -> tuple[Part, Manifold]:
     """
-    A blade with a round bite of diameter `size` [m] out of its leading edge, and the piece that
-    went.
+    Blade with a round bite of diameter `size` [m] out of its edge, and the piece that went.
+
+    The bite is in the leading edge.
 
     The contact pieces are re-cut finely, so that the robot feels the gap to about a centimetre.
     """
@@ -163,8 +176,10 @@ def _index(blade: str) -> int:
 
 def _section(chord: float, camber: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
     """
-    A cambered NACA four-digit-like section about mid-chord, (2n,) axial and tangential
-    coordinates: the suction side from nose to tail, then the pressure side back.
+    Draw a cambered NACA four-digit-like section about mid-chord.
+
+    (2n,) axial and tangential coordinates: the suction side from nose to tail, then the pressure
+    side back.
     """
     u = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, _SECTION_POINTS)))
     half = (
@@ -189,7 +204,11 @@ def _blade(row: BladeRow, index: int) -> Part:
 
 
 def _blade_hulls(sections: np.ndarray, chord_pieces: int = 2, span_pieces: int = 5) -> Hulls:
-    """Convex pieces: the loft sliced along span and chord (twist and camber make the whole blade concave)."""
+    """
+    Convex pieces: the loft sliced along span and chord.
+
+    Twist and camber make the whole blade concave.
+    """
     side = sections.shape[1] // 2
     spans = np.linspace(0, len(sections) - 1, span_pieces + 1).round().astype(int)
     chords = np.linspace(0, side - 1, chord_pieces + 1).round().astype(int)
@@ -248,7 +267,11 @@ def _hub() -> Part:
 
 
 def _hub_hulls(stations: np.ndarray) -> Hulls:
-    """The upper part of the hub: convex over the nose, and over each conical piece behind it."""
+    """
+    Take the upper part of the hub.
+
+    It is convex over the nose, and over each conical piece behind it.
+    """
     azimuths = np.radians(np.linspace(-_CONTACT_AZIMUTH, _CONTACT_AZIMUTH, 51))
     nose = stations[stations <= _NOSE_END + 1e-9]
     pieces = [nose, *zip(stations[len(nose) - 1 :], stations[len(nose) :], strict=False)]
@@ -320,7 +343,7 @@ def _boss(index: int, x: float, azimuth_deg: float, radius: float, height: float
 def _panel(
     name: str, x: tuple[float, float], azimuth_deg: tuple[float, float], height: float
 ) -> Part:
-    """A raised patch of the casing's wall, in contact pieces of about 4 degrees."""
+    """Raise a patch of the casing's wall, in contact pieces of about 4 degrees."""
     inner = casing_radius(np.array(x)) - height
     profile = np.array([[x[0], inner[0]], [x[1], inner[1]], [x[1], 1.52], [x[0], 1.52]])
     count = round((azimuth_deg[1] - azimuth_deg[0]) / 4.0)

@@ -1,6 +1,7 @@
 """
-Scenes S1-S9: the engine with objects that somebody left behind, with features that are gone, or
-with both.
+Scenes S1-S9: the engine with something changed.
+
+With objects that somebody left behind, with features that are gone, or with both.
 
 Anomalies are 3-15 cm long and lie on the walls and blades round the robot's way (azimuth 0, 1 m
 from the axis).
@@ -40,7 +41,11 @@ _EMBED = (
 
 @dataclass(frozen=True)
 class Left:
-    """An object lying on the hub or stuck to the casing at (x, azimuth), turned about the wall's normal."""
+    """
+    An object lying on the hub or stuck to the casing at (x, azimuth).
+
+    It is turned about the wall's normal.
+    """
 
     what: str
     wall: str
@@ -154,7 +159,11 @@ def _apply(change: Change, parts: dict[str, Part]) -> Manifold:
 
 
 def _anomaly(change: Change, body: Manifold, as_built: Manifold, changed: Manifold) -> Anomaly:
-    """What of `body` only one of the two scenes has (what sinks into a wall makes no difference)."""
+    """
+    Keep what of `body` only one of the two scenes has.
+
+    What sinks into a wall makes no difference.
+    """
     if isinstance(change, Left | Lodged):
         return Anomaly(change.what, 'added', *mesh_of(_largest(body - as_built)))
     name = change.part if isinstance(change, Gone) else f'{change.blade}_edge'
@@ -162,7 +171,11 @@ def _anomaly(change: Change, body: Manifold, as_built: Manifold, changed: Manifo
 
 
 def _largest(solid: Manifold) -> Manifold:
-    """The largest connected piece: subtraction leaves slivers where faceted surfaces nearly coincide."""
+    """
+    Keep the largest connected piece.
+
+    Subtraction leaves slivers where faceted surfaces nearly coincide.
+    """
     return max(solid.decompose(), key=lambda piece: piece.volume())
 
 

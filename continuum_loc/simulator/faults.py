@@ -1,6 +1,7 @@
 """
-Faults on request: each wraps a stream of samples, from the simulator or from a bag, and yields the
-faulty stream.
+Faults on request: each wraps a stream of samples and yields the faulty stream.
+
+The samples come from the simulator or from a bag.
 
     faulty = Dropout(sensors=("ring2_*",), probability=0.3, seed=1)(samples)
 
@@ -45,7 +46,11 @@ def source(sample: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """Base: applies `alter` to the chosen sensors' samples in [start, end); `alter` returns what goes on, or None."""
+    """
+    Base: applies `alter` to the chosen sensors' samples in [start, end).
+
+    `alter` returns what goes on, or None.
+    """
 
     sensors: tuple[str, ...] = ('*',)
     start: float = 0.0
@@ -71,7 +76,7 @@ class Fault:
                 yield sample
 
     def strikes(self, sample: Any, epoch: int) -> bool:
-        """Whether the sample is one of the chosen sensors', at a time when the fault is present."""
+        """Whether the sample is one of the chosen sensors', while the fault is present."""
         if (
             isinstance(sample, TruthSample)
             or not self.start <= seconds(sample.stamp, epoch) < self.end
@@ -80,7 +85,11 @@ class Fault:
         return any(fnmatchcase(source(sample), pattern) for pattern in self.sensors)
 
     def alter(self, sample: Any, rng: np.random.Generator, memory: dict[str, Any]) -> Any | None:
-        """The faulty sample. `memory` holds each source's last sample from before the fault."""
+        """
+        Return the faulty sample.
+
+        `memory` holds each source's last sample from before the fault.
+        """
         raise NotImplementedError
 
 
@@ -105,7 +114,11 @@ class Freeze(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class BiasStep(Fault):
-    """A constant is added from `start` on: rad/s on gyros, m/s^2 on accelerometers, T on Hall sensors."""
+    """
+    A constant is added from `start` on.
+
+    rad/s on gyros, m/s^2 on accelerometers, T on Hall sensors.
+    """
 
     gyro: tuple[float, float, float] = (0.0, 0.0, 0.0)
     accelerometer: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -126,8 +139,9 @@ class BiasStep(Fault):
 @dataclass(frozen=True, kw_only=True)
 class Outliers(Fault):
     """
-    Each valid ToF zone, with `probability`, reads a range drawn evenly from `ranges` [m], still
-    called valid.
+    Each valid ToF zone, with `probability`, reads a range drawn evenly from `ranges` [m].
+
+    It is still called valid.
 
     IMU samples get, with the same probability, a spike of `gyro_spike` rad/s about a random axis.
     """
@@ -156,7 +170,11 @@ class Outliers(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class ClockOffset(Fault):
-    """A wrong clock: stamps are late by `offset` s, `jitter` s (1 sigma) and `drift` s/s since `start`."""
+    """
+    A wrong clock.
+
+    Stamps are late by `offset` s, `jitter` s (1 sigma) and `drift` s/s since `start`.
+    """
 
     offset: float = 0.0
     jitter: float = 0.0
@@ -170,7 +188,11 @@ class ClockOffset(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class Delay(Fault):
-    """Samples arrive `delay` s late, give or take `jitter` s (1 sigma, never early), with their stamps right."""
+    """
+    Samples arrive late, with their stamps right.
+
+    By `delay` s, give or take `jitter` s (1 sigma, never early).
+    """
 
     delay: float = 0.05
     jitter: float = 0.0
@@ -200,8 +222,7 @@ def miscalibrated(
     sensors: tuple[str, ...] = ('*',),
 ) -> RobotDescription:
     """
-    The robot with every chosen sensor mounted a little wrong, for `World`; estimate with the
-    nominal one.
+    Mount every chosen sensor a little wrong, for `World`; estimate with the nominal robot.
 
     position_sigma: m, rotation_sigma_deg: deg, both per axis (1 sigma).
     """

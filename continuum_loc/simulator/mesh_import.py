@@ -1,4 +1,8 @@
-"""Scenes from a mesh that a user brings: checks that say what to change, and convex pieces for contact."""
+"""
+Scenes from a mesh that a user brings.
+
+Checks that say what to change, and convex pieces for contact.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,9 @@ _WALL = 0.05  # thickness given to a room that is modelled by its inner surface 
 
 def import_mesh(path: Path) -> Scene:
     """
-    A scene from an STL, OBJ or PLY file in metres and the map frame. Raises SceneError.
+    Import a scene from an STL, OBJ or PLY file in metres and the map frame.
+
+    Raises SceneError.
 
     The mesh is either a solid (faces counter-clockwise seen from outside), or the inner surface of
     a room (faces counter-clockwise seen from inside).
@@ -29,7 +35,11 @@ def import_mesh(path: Path) -> Scene:
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
-    """Raise SceneError unless a mesh has a credible size, no degenerate faces and no holes, and is oriented."""
+    """
+    Raise SceneError unless a mesh can be a scene.
+
+    It needs a credible size, no degenerate faces and no holes, and an orientation.
+    """
     if len(faces) == 0:
         raise SceneError(f'{where}: no faces; export a triangle mesh, not points or curves')
     if not np.all(np.isfinite(vertices)):
@@ -124,7 +134,7 @@ def _scene(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Scene:
 
 
 def with_walls(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A solid as it is; the inner surface of a room as the walls round it."""
+    """Give a solid as it is; the inner surface of a room as the walls round it."""
     if _volume(vertices, faces) > 0.0:
         return vertices, faces
     from continuum_loc.simulator.solids import mesh_of, solid_of

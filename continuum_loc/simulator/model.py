@@ -1,6 +1,7 @@
 """
-The robot as a MuJoCo model: a rod of rigid links on ball joints, tendons, an insertion drive,
-contacts.
+The robot as a MuJoCo model.
+
+A rod of rigid links on ball joints, tendons, an insertion drive, contacts.
 
 Nodes at s_0 = 0 ... s_N = L. Body i is rigid and centred on node i; it reaches half a segment to
 each side, and neighbours meet in a joint in the middle of their segment. So node i is the middle
@@ -54,7 +55,7 @@ def build_spec(
     supported: bool = False,
 ) -> mujoco.MjSpec:
     """
-    The model before compilation.
+    Build the model before compilation.
 
     `scene` gives the convex pieces to collide with, None the empty space; `supported` lets
     something else carry the rod's weight.
@@ -145,7 +146,7 @@ def uniform_rod(
     time_step: float = 0.005,
 ) -> mujoco.MjModel:
     """
-    A plain rod along x, clamped at the origin, for comparison with mechanics.
+    Make a plain rod along x, clamped at the origin, for comparison with mechanics.
 
     Its last body, `tip`, has no mass and lies at the rod's end: loads go there.
     """
@@ -168,7 +169,11 @@ def uniform_rod(
 
 
 def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> None:
-    """Joint springs are implicit; what stays explicit is the insertion drive, stable to omega * step < 2."""
+    """
+    Check that the time step is stable: omega * step < 2 of the insertion drive.
+
+    It alone stays explicit; joint springs are implicit.
+    """
     omega = np.sqrt(plant.carriage_stiffness / plant.carriage_mass)
     if omega * time_step > 1.0:
         raise SettingsError(
@@ -194,7 +199,11 @@ def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndar
 
 
 def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
-    """The body that the rod's first node is fixed to, on its insertion slide where the base can travel."""
+    """
+    Add the body that the rod's first node is fixed to.
+
+    On its insertion slide where the base can travel.
+    """
     import mujoco
 
     quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
@@ -219,7 +228,11 @@ def carriage_damping(plant: PlantSettings) -> float:
 
 
 def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
-    """The spring between nodes i - 1 and i, in the middle of their segment: EI / h, and EA / h where it stretches."""
+    """
+    Add the spring between nodes i - 1 and i, in the middle of their segment.
+
+    EI / h, and EA / h where it stretches.
+    """
     import mujoco
 
     pos = (-segment / 2.0, 0.0, 0.0)
@@ -244,7 +257,11 @@ def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
 def _add_link(
     body, robot: RobotDescription, plant: PlantSettings, back: float, forth: float
 ) -> None:
-    """Inertia of a solid cylinder from -back to +forth of the node, and the capsule that touches the scene."""
+    """
+    Add a link from -back to +forth of the node.
+
+    The inertia of a solid cylinder, and the capsule that touches the scene.
+    """
     import mujoco
 
     length, centre = back + forth, (forth - back) / 2.0
@@ -267,8 +284,9 @@ def _add_link(
 
 def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
     """
-    Each tendon threads a channel in every link up to its module's end; its actuator pulls with
-    ctrl newtons.
+    Thread each tendon through a channel in every link up to its module's end.
+
+    Its actuator pulls with ctrl newtons.
 
     A channel opens at GUIDE / 2 of a segment from each joint. Its straight stretch across the
     joint has the moment arm r cos(phi / 2) + GUIDE h / 2 sin(phi / 2): short stretches keep the
@@ -325,7 +343,11 @@ def _add_scene(spec, robot: RobotDescription, plant: PlantSettings, scene) -> No
 
 
 def _reachable(robot: RobotDescription, vertices: np.ndarray) -> bool:
-    """Whether a piece's bounding box meets the capsule-shaped reach of the rod over its whole insertion."""
+    """
+    Whether a piece's bounding box meets the reach of the rod over its whole insertion.
+
+    The reach is shaped like a capsule.
+    """
     T = robot.base.T_map_base
     travel = np.linspace(*robot.base.insertion.range, 8)
     origins = T[:3, 3] + travel[:, None] * T[:3, 0]

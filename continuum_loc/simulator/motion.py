@@ -39,7 +39,7 @@ class Motion:
         self._states: deque[State] = deque(maxlen=4)
 
     def append(self, state: State) -> None:
-        """The next state, one time step after the last."""
+        """Append the next state, one time step after the last."""
         self._states.append(state)
 
     def covers(self, time: float) -> bool:
@@ -68,8 +68,9 @@ class Motion:
         self, time: float, frames: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Pose T_map_frame (F, 4, 4), body twist (F, 6) [v; w] and acceleration of the origin (F, 3)
-        in map.
+        Pose T_map_frame (F, 4, 4), body twist (F, 6) and acceleration of the origin (F, 3).
+
+        Twists are [v; w]; the acceleration is in map.
 
         `frames` are the four states of `frames()`. The acceleration is the second difference of
         position, linear between the steps.
@@ -99,7 +100,11 @@ class Motion:
         )
 
     def encoders(self, time: float) -> tuple[float, np.ndarray, np.ndarray]:
-        """Insertion [m], tendon lengths (K,) [m] and tensions (K,) [N], linear between the steps."""
+        """
+        Read insertion [m], tendon lengths (K,) [m] and tensions (K,) [N] at `time`.
+
+        They are linear between the steps.
+        """
         u, _ = self._at(time)
         a, b = self._states[1], self._states[2]
         return tuple(
@@ -114,8 +119,9 @@ class Motion:
 
 def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
     """
-    (N, 6) strain [nu; omega] of each segment: the screw that takes one node to the next, per unit
-    of s.
+    (N, 6) strain [nu; omega] of each segment.
+
+    The screw that takes one node to the next, per unit of s.
 
     For pure bending this is the constant-curvature arc that is tangent to both links at their
     middles.
@@ -124,7 +130,11 @@ def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
 
 
 def backbone(T_map_node: np.ndarray, nodes_s: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) poses T_map_backbone(s) along the arcs through the nodes; s (...) in [0, L]."""
+    """
+    Poses (..., 4, 4) of T_map_backbone along the arcs through the nodes.
+
+    s (...) is in [0, L].
+    """
     s = np.asarray(s, float)
     if np.any(s < nodes_s[0] - 1e-9) or np.any(s > nodes_s[-1] + 1e-9):
         raise ValueError(

@@ -1,6 +1,7 @@
 """
-The true plant: what only the simulator knows of a robot (stiffness, mass, friction, tendons,
-steps).
+The true plant: what only the simulator knows of a robot.
+
+Stiffness, mass, friction, tendons, steps.
 
 The estimator never reads these files; see `continuum_loc.robot` for what both sides share.
 """
@@ -78,14 +79,18 @@ class PlantSettings(Settings):
         return self
 
     def profile(self, name: str) -> Profile:
-        """The profile called `name`. Raises SettingsError listing the valid names."""
+        """
+        Return the profile called `name`.
+
+        Raises SettingsError listing the valid names.
+        """
         if name not in self.profiles:
             raise SettingsError(f"no profile '{name}'; profiles: {', '.join(self.profiles)}")
         return self.profiles[name]
 
     @property
     def tendon_names(self) -> tuple[str, ...]:
-        """Names of all tendons, set by set (counted from 1): the order of every array of tensions."""
+        """Names of all tendons, set by set (counted from 1): the order of arrays of tensions."""
         return tuple(
             f'tendon{i + 1}_{k + 1}'
             for i, group in enumerate(self.tendons)
@@ -99,8 +104,9 @@ class PlantSettings(Settings):
 
     def tension_for_moments(self, moments: np.ndarray, pretension: float = 2.0) -> np.ndarray:
         """
-        Tensions (..., K) [N], none below `pretension`, whose moments add up to the bending moments
-        wanted.
+        Tensions (..., K) [N] whose moments add up to the bending moments wanted.
+
+        None is below `pretension`.
 
         moments: (..., G, 2) total moment about body y and z [N m] inside each tendon set's own
         stretch, base to tip. A set also bends every stretch before its own, so it supplies the
@@ -130,8 +136,9 @@ class PlantSettings(Settings):
 
 def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.ndarray:
     """
-    Least tensions of one set that give `moment` (..., 2); what a lone tendon cannot give is left
-    out.
+    Least tensions of one set that give `moment` (..., 2).
+
+    What a lone tendon cannot give is left out.
 
     A tension F at offset r gives the moment r x (-F x): per newton (-r_z, r_y) about (y, z).
     """
@@ -146,7 +153,7 @@ def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.nda
 
 
 def load_plant(name_or_path: str | Path) -> PlantSettings:
-    """The plant of a bundled robot (by the robot's name), or one of your own from a YAML file."""
+    """Load the plant of a bundled robot (by the robot's name), or one from a YAML file."""
     return load_bundled(PlantSettings, PLANTS_FOLDER, name_or_path, 'plant')
 
 
@@ -154,8 +161,9 @@ def node_arclengths(
     robot: RobotDescription, plant: PlantSettings, link_length: float
 ) -> np.ndarray:
     """
-    (N + 1,) arclengths of the rod's nodes: base, tip, every ring and module end, evenly cut
-    between them.
+    (N + 1,) arclengths of the rod's nodes.
+
+    Base, tip, every ring and module end, evenly cut between them.
 
     A node at every ring makes the ring's pose a body's pose, with no interpolation between the
     two.

@@ -1,4 +1,8 @@
-"""Ray casting: the scene by Embree (through Open3D), the robot's own body as capsules by a compiled kernel."""
+"""
+Ray casting.
+
+The scene by Embree (through Open3D), the robot's own body as capsules by a compiled kernel.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +44,11 @@ class RayCaster:
         return hits['t_hit'].numpy().astype(float), faces, normals
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (N,) from points (N, 3) to the nearest surface [m], negative inside solid matter."""
+        """
+        Distance (N,) from points (N, 3) to the nearest surface [m].
+
+        It is negative inside solid matter.
+        """
         return (
             self._embree.compute_signed_distance(self._tensor(np.asarray(points, np.float32)))
             .numpy()
@@ -51,8 +59,9 @@ class RayCaster:
 @njit(cache=True)
 def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndarray) -> np.ndarray:
     """
-    Distance (S, K) along the K unit rays of S fans to the first of M capsules, inf where none is
-    hit.
+    Distance (S, K) along the K unit rays of S fans to the first of M capsules.
+
+    inf where none is hit.
 
     origins: (S, 3). directions: (S, K, 3). Each capsule (M, 7) is ax ay az bx by bz radius: all
     points within `radius` of the segment from a to b. A fan that starts inside a capsule (its own
@@ -105,7 +114,11 @@ def _enclosing_cone(directions):
 
 @njit(cache=True)
 def _outside_cone(cone_axis, half_angle, axis, offset, radius):
-    """True where a capsule's bounding ball is clear of the fan's cone: sifts out nearly all of the body at once."""
+    """
+    Tell where a capsule's bounding ball is clear of the fan's cone.
+
+    This sifts out nearly all of the body at once.
+    """
     to_centre = 0.5 * axis - offset
     reach = 0.5 * np.sqrt(_dot(axis, axis)) + radius
     distance = np.sqrt(_dot(to_centre, to_centre))
@@ -146,7 +159,7 @@ def _ball_entry(ww, wd, radius):
 
 @njit(cache=True)
 def _inside(vv, vw, ww, radius):
-    """True where the origin lies within the capsule."""
+    """Tell where the origin lies within the capsule."""
     station = min(max(vw / vv, 0.0), 1.0) if vv > 0.0 else 0.0
     return ww - 2.0 * station * vw + station * station * vv <= radius * radius
 

@@ -18,8 +18,9 @@ LOAD_STEPS = 4  # the load grows in steps, each started from the last solution
 
 def elastica_tip(force: float, EI: float, length: float) -> tuple[float, float]:
     """
-    Tip (x, deflection) [m] of a weightless cantilever along x under a force across its undeformed
-    axis [N].
+    Tip (x, deflection) [m] of a weightless cantilever along x under a force [N].
+
+    The force acts across the undeformed axis.
 
     Bisshopp and Drucker (1945): F(pi/2, k) - F(phi, k) = L sqrt(P / EI), with sin phi = 1 / (k
     sqrt 2).
@@ -37,7 +38,11 @@ def elastica_tip(force: float, EI: float, length: float) -> tuple[float, float]:
 
 
 def first_frequency(EI: float, mass_per_metre: float, length: float) -> float:
-    """First bending frequency [Hz] of a slender cantilever without gravity (Euler and Bernoulli)."""
+    """
+    First bending frequency [Hz] of a slender cantilever without gravity.
+
+    By Euler and Bernoulli.
+    """
     return (FIRST_MODE / length) ** 2 * np.sqrt(EI / mass_per_metre) / (2.0 * np.pi)
 
 

@@ -45,7 +45,11 @@ SIDES = 48
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole at `eye` looking at `target` (map, m), z up; what lies before the plane y = `section` is cut away."""
+    """
+    A pinhole at `eye` looking at `target` (map, m), z up.
+
+    What lies before the plane y = `section` is cut away.
+    """
 
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -133,7 +137,11 @@ def render(shapes: list[Shape], camera: Camera, daylight: int = 0) -> np.ndarray
 def robot_shapes(
     robot: RobotDescription, T_map_backbone: np.ndarray, T_map_ring: np.ndarray
 ) -> list[Shape]:
-    """The body along the backbone (B, 4, 4), a dark band at every ring (R, 4, 4), and each sensor on its mount."""
+    """
+    Draw the body along the backbone (B, 4, 4), and each sensor on its mount.
+
+    A dark band marks every ring (R, 4, 4).
+    """
     shapes = [_tube(T_map_backbone, robot.radius, BODY)]
     band = np.tile(np.eye(4), (2, 1, 1))
     band[:, 0, 3] = [-0.4 * robot.radius, 0.0]
@@ -145,7 +153,11 @@ def robot_shapes(
 
 
 def scene_shapes(scene: Scene) -> list[Shape]:
-    """The scene in its parts' colours; in the engine, what was added to it and what is missing from it stand out."""
+    """
+    Draw the scene in its parts' colours.
+
+    In the engine, what was added to it and what is missing from it stand out.
+    """
     added = {anomaly.name for anomaly in scene.anomalies if anomaly.kind == 'added'} - set(PAINT)
     colours = [ADDED if name in added else PAINT.get(name, SCENE) for name in scene.objects]
     palette = sorted(set(colours))

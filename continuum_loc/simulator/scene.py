@@ -1,4 +1,8 @@
-"""What a scene is: a mesh for sensors, convex pieces for contact, and how it departs from its as-built version."""
+"""
+What a scene is.
+
+A mesh for sensors, convex pieces for contact, and how it departs from its as-built version.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +25,7 @@ class SceneError(ValueError):
 @dataclass(frozen=True, eq=False)
 class Anomaly:
     """
-    What a scene has that its as-built version has not (`added`), or the other way round
-    (`missing`).
+    What a scene has that its as-built version has not (`added`), or the reverse (`missing`).
 
     `vertices` (V, 3) and `faces` (F, 3) bound the solid that was added or taken away, in the map
     frame.
@@ -84,7 +87,11 @@ def scene_of_solid(
     parts: list[Part],
     anomalies: tuple[Anomaly, ...] = (),
 ) -> Scene:
-    """The scene of united parts; `owners` (F,) is the index of each face's part (see `solids.unite`)."""
+    """
+    Make the scene of united parts.
+
+    `owners` (F,) is the index of each face's part (see `solids.unite`).
+    """
     vertices, faces = mesh_of(solid)
     reflectance = np.array([part.reflectance for part in parts])[owners]
     hulls = tuple(hull for part in parts for hull in part.hulls)

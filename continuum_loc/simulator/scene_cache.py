@@ -20,7 +20,7 @@ import numpy as np
 
 def cached_scene(name: str, made_from: Iterable[Path], build: Callable[[], Scene]) -> Scene:
     """
-    The scene `name` from the cache, or built and put there.
+    Take the scene `name` from the cache, or build it and put it there.
 
     `made_from`: files whose content decides the scene.
     """

@@ -1,6 +1,7 @@
 """
-Sensor models other than ToF: true motion in, samples with noise, bias, quantisation and saturation
-out.
+Sensor models other than ToF.
+
+True motion in, samples with noise, bias, quantisation and saturation out.
 
 Each model owns one random stream, so that one sensor's noise does not depend on which others are
 simulated.
@@ -164,7 +165,11 @@ class Trackers:
 
 
 class Encoders:
-    """Tendon displacement (0 when straight) and force, base insertion unless its sigma is None; position is noisy."""
+    """
+    Tendon displacement (0 when straight) and force, and base insertion.
+
+    No insertion where its sigma is None; position is noisy.
+    """
 
     def __init__(
         self,
@@ -187,7 +192,11 @@ class Encoders:
     def measure(
         self, stamp: int, insertion: float, tendon_length: np.ndarray, tension: np.ndarray
     ) -> EncoderSample:
-        """Lengths and tensions (K,) in the order of the names; a pulled tendon's displacement is negative."""
+        """
+        Lengths and tensions (K,) in the order of the names.
+
+        A pulled tendon's displacement is negative.
+        """
         position = tendon_length - self.straight_length
         if self.insertion:
             position, tension = np.append(position, insertion), np.append(tension, 0.0)

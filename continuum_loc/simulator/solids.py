@@ -1,6 +1,7 @@
 """
-Solids for procedurally made scenes: parts, their union into one watertight mesh,
-and how to place them.
+Solids for procedurally made scenes.
+
+Parts, their union into one watertight mesh, and how to place them.
 
 Map frame throughout; metres. `azimuth` turns about the map's x axis, from +z (0 deg) towards +y.
 """
@@ -14,14 +15,17 @@ import numpy as np
 
 Hulls = tuple[np.ndarray, ...]
 
-_ROBUST_EDGE = 1e-5  # slivers thinner than this are collapsed: single-precision ray casters slip through them [m]
+# Slivers thinner than this [m] are collapsed: single-precision ray casters slip through them.
+_ROBUST_EDGE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
     """
-    A named solid, the convex pieces (n, 3) that stand for it in contact, and how much of a ToF
-    sensor's infrared light it reflects (0..1, at normal incidence).
+    A named solid, and what stands for it.
+
+    In contact its convex pieces (n, 3); to a ToF sensor how much of its infrared light it reflects
+    (0..1, at normal incidence).
     """
 
     name: str
@@ -31,12 +35,12 @@ class Part:
 
 
 def convex_part(name: str, solid: Manifold, reflectance: float = 0.5) -> Part:
-    """A part which is its own contact piece; `solid` must be convex (or nearly)."""
+    """Make a part which is its own contact piece; `solid` must be convex (or nearly)."""
     return Part(name, solid, (vertices_of(solid),), reflectance)
 
 
 def unite(parts: list[Part]) -> tuple[Manifold, np.ndarray]:
-    """Union of all parts, and the index of the part that each of its faces belongs to (F,) int32."""
+    """Union of all parts, and the index (F,) int32 of the part that each of its faces is of."""
     originals = [part.solid.as_original() for part in parts]
     union = Manifold.batch_boolean(originals, OpType.Add).simplify(_ROBUST_EDGE)
     mesh = union.to_mesh64()
@@ -47,7 +51,11 @@ def unite(parts: list[Part]) -> tuple[Manifold, np.ndarray]:
 
 
 def mesh_of(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and faces (F, 3) int32 of a solid, in the face order of `Manifold.to_mesh64`."""
+    """
+    Vertices (V, 3) float64 and faces (F, 3) int32 of a solid.
+
+    Faces are in the order of `Manifold.to_mesh64`.
+    """
     mesh = solid.to_mesh64()
     return np.ascontiguousarray(mesh.vert_properties[:, :3]), mesh.tri_verts.astype(np.int32)
 
@@ -59,7 +67,7 @@ def vertices_of(solid: Manifold) -> np.ndarray:
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
     """
-    The solid inside a closed mesh.
+    Make the solid inside a closed mesh.
 
     Raises ValueError where the mesh is not a closed, oriented surface.
     """
@@ -73,12 +81,12 @@ def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
 
 
 def box(size: tuple[float, float, float]) -> Manifold:
-    """A cuboid centred on the origin."""
+    """Make a cuboid centred on the origin."""
     return Manifold.cube(size, center=True)
 
 
 def cylinder(radius: float, height: float, segments: int = 32) -> Manifold:
-    """A cylinder centred on the origin, its axis z."""
+    """Make a cylinder centred on the origin, its axis z."""
     return Manifold.cylinder(height, radius, radius, segments, center=True)
 
 
@@ -86,8 +94,10 @@ def on_cylinder(
     solid: Manifold, x: float, azimuth_deg: float, radius: float, turn_deg: float = 0.0
 ) -> Manifold:
     """
-    Move a solid to a place on the engine's wall: its z becomes radial (outward), its x axial, its
-    y circumferential, after a turn about its own z.
+    Move a solid to a place on the engine's wall.
+
+    Its z becomes radial (outward), its x axial, its y circumferential, after a turn about its own
+    z.
     """
     radial = radial_direction(azimuth_deg)
     rotation = np.column_stack([[1.0, 0.0, 0.0], tangent_direction(azimuth_deg), radial])
@@ -116,7 +126,11 @@ def wrap(x: np.ndarray, azimuth: np.ndarray, radius: np.ndarray) -> np.ndarray:
 def lathe(
     profile: np.ndarray, segments: int, azimuth_deg: tuple[float, float] = (-180.0, 180.0)
 ) -> Manifold:
-    """Revolve a closed profile (n, 2) of (x, r) about the map's x axis, over a range of azimuth."""
+    """
+    Revolve a closed profile (n, 2) of (x, r) about the map's x axis.
+
+    Over a range of azimuth.
+    """
     profile = np.asarray(profile, dtype=float)
     radius_x = profile[:, ::-1]
     if _signed_area(radius_x) < 0.0:
@@ -131,8 +145,10 @@ def lathe(
 
 def loft(sections: np.ndarray) -> Manifold:
     """
-    The solid through closed sections (m, n, 3); each has n points, first half on one side and
-    second half on the other in reverse, so that point i faces point n-1-i (the caps join them).
+    Make the solid through closed sections (m, n, 3).
+
+    Each has n points, first half on one side and second half on the other in reverse, so that
+    point i faces point n-1-i (the caps join them).
     """
     stations, around = sections.shape[:2]
     ring = np.arange(around)
@@ -170,6 +186,6 @@ def _signed_area(polygon: np.ndarray) -> float:
 
 
 def cut_hulls(hulls: Hulls, cutter: Manifold) -> Hulls:
-    """What is left of convex pieces beyond a cutter (each remainder is hulled again)."""
+    """Keep what is left of convex pieces beyond a cutter (each remainder is hulled again)."""
     remainders = [Manifold.hull_points(hull) - cutter for hull in hulls]
     return tuple(vertices_of(rest.hull()) for rest in remainders if not rest.is_empty())

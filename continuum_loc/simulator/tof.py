@@ -31,8 +31,10 @@ _BODY_REFLECTANCE = 0.3 * np.pi / 4.0
 @dataclass(frozen=True, eq=False)
 class Echoes:
     """
-    What K rays of S sensors meet: distance (S, K) along the ray [m], inf where nothing; and the
-    share of light that comes back (S, K), reflectance times cosine of incidence.
+    What K rays of S sensors meet.
+
+    Distance (S, K) along the ray [m], inf where nothing; and the share of light that comes back
+    (S, K), reflectance times cosine of incidence.
     """
 
     distance: np.ndarray
@@ -143,7 +145,7 @@ class PaperReceiver:
         )
 
     def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings:
-        """Readings (S, Z) of echoes (S, Z)."""
+        """Turn echoes (S, Z) into readings (S, Z)."""
         model, raw = self._model, echoes.distance * self._raw_per_range
         noise = rng.standard_normal(
             raw.shape

@@ -36,8 +36,9 @@ class Command:
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """
-    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; held before the first and after
-    the last.
+    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m.
+
+    They are held before the first and after the last.
 
     supported: the arm lies in a groove that carries its weight.
     """
@@ -76,7 +77,7 @@ class Trajectory:
         return float(self.times[-1])
 
     def command(self, time: float) -> Command:
-        """The command at `time` [s]."""
+        """Give the command at `time` [s]."""
         t = min(max(time, self.times[0]), self.times[-1])
         value, rate = self._spline(t), self._spline(t, 1)
         return Command(value[:-1], float(value[-1]), float(rate[-1]))
@@ -144,7 +145,11 @@ class Keyframe(Settings):
 
 
 class TrajectoryFile(Settings):
-    """A trajectory of your own, as YAML: `keyframes`, and whether the arm is `supported` against gravity."""
+    """
+    A trajectory of your own, as YAML.
+
+    `keyframes`, and whether the arm is `supported` against gravity.
+    """
 
     keyframes: tuple[Keyframe, ...] = Field(min_length=2)
     supported: bool = False
@@ -154,7 +159,7 @@ def trajectory(
     name: str, robot: RobotDescription, plant: PlantSettings, seed: int = 0
 ) -> Trajectory:
     """
-    The named trajectory of this robot, or one of your own from a YAML file (`TrajectoryFile`).
+    Find the named trajectory of this robot, or load one from a YAML file (`TrajectoryFile`).
 
     A seed other than 0 varies every keyframe after the rest by some percent.
     """
@@ -215,8 +220,9 @@ def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Traject
 
 def _level_moments(robot: RobotDescription, plant: PlantSettings) -> np.ndarray:
     """
-    (G, 2) bending moments, constant in each module, whose mean holds a level rod against its own
-    weight.
+    (G, 2) bending moments whose mean holds a level rod against its own weight.
+
+    They are constant in each module.
 
     A cantilever's moment is w (L - s)^2 / 2; the mean over [a, b] is w ((L - a)^3 - (L - b)^3) /
     (6 (b - a)).

@@ -1,6 +1,7 @@
 """
-What a VL53L5CX makes of the light that comes back: one perpendicular distance and a status for
-each zone.
+What a VL53L5CX makes of the light that comes back.
+
+One perpendicular distance and a status for each zone.
 
 A zone sees 4x4 sub-rays over its solid angle. Their light lies on a histogram of depth (distance
 along the optical axis); pulses nearer than the pulse's width merge, which puts mixed readings
@@ -70,7 +71,7 @@ class Vl53l5cxReceiver:
         self._had_target: dict[str, np.ndarray] = {}
 
     def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings:
-        """Readings (S, Z) of echoes (S, Z * sub_rays^2)."""
+        """Turn echoes (S, Z * sub_rays^2) into readings (S, Z)."""
         depth, signal, spread = self._own_targets(echoes)
         depth, signal, blurred = self._leak(depth, signal)
         sigma = self._sigma(depth, signal, spread)
@@ -89,7 +90,11 @@ class Vl53l5cxReceiver:
         return Readings(ranges, np.where(measured, stated, np.nan), status)
 
     def _own_targets(self, echoes: Echoes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth, signal and spread (S, Z) of each zone's target, before crosstalk; signal 0 where there is none."""
+        """
+        Depth, signal and spread (S, Z) of each zone's target, before crosstalk.
+
+        Signal is 0 where there is none.
+        """
         zones, sub_rays = self._sub_directions.shape[:2]
         distance = echoes.distance.reshape(-1, sub_rays)
         seen = np.isfinite(distance)
@@ -111,8 +116,9 @@ class Vl53l5cxReceiver:
         self, depth: np.ndarray, signal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Depth and signal (S, Z) with the light of the brightest neighbour mixed in, and where it
-        drowns the zone's own target.
+        Depth and signal (S, Z) with the light of the brightest neighbour mixed in.
+
+        And where it drowns the zone's own target.
         """
         shape = (len(depth), self._model.rows, self._model.columns)
         neighbour_signal, neighbour_depth = _brightest_neighbour(
@@ -126,7 +132,11 @@ class Vl53l5cxReceiver:
         return depth + share * (leak_depth - depth), np.where(drowned, leak, signal), drowned
 
     def _sigma(self, depth: np.ndarray, signal: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        """Noise (S, Z) of the depth [m]: Table I and a floor, more for faint targets and for broadened pulses."""
+        """
+        Noise (S, Z) of the depth [m]: Table I and a floor.
+
+        More for faint targets and for broadened pulses.
+        """
         settings = self._settings
         base = np.hypot(self._model.sigma(depth), settings.noise_floor)
         faintness = 1.0 + settings.threshold / np.maximum(signal, settings.threshold)
@@ -166,7 +176,11 @@ class Vl53l5cxReceiver:
         return np.select(conditions, statuses, TOF_VALID).astype(np.uint8)
 
     def _memory(self, names: Sequence[str]) -> np.ndarray:
-        """(S, Z) int8: 1 where the zone had a target in the frame before, 0 where not, -1 at the first frame."""
+        """
+        (S, Z) int8: 1 where the zone had a target in the frame before, 0 where not.
+
+        -1 at the first frame.
+        """
         unknown = np.full(len(self._zone_cosine), -1, dtype=np.int8)
         return np.stack([self._had_target.get(name, unknown).astype(np.int8) for name in names])
 
@@ -184,7 +198,11 @@ def _sub_directions(model: TofModel, sub_rays: int) -> np.ndarray:
 
 
 def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signal and depth (S, rows, columns) of the brightest of the up to eight zones round each zone."""
+    """
+    Signal and depth (S, rows, columns) of the brightest neighbour of each zone.
+
+    There are up to eight round it.
+    """
     rows, columns = signal.shape[1:]
     margin = ((0, 0), (1, 1), (1, 1))
     padded = np.pad(signal, margin), np.pad(depth, margin)
@@ -226,7 +244,11 @@ def _targets(depth, signal, width, threshold, closest):
 
 @njit(cache=True)
 def _gather(depth, signal, centre, width):
-    """Total, mean depth and standard deviation of the returns within `width` of a depth, weighted."""
+    """
+    Total, mean depth and standard deviation of the returns within `width` of a depth.
+
+    They are weighted.
+    """
     total, first, second = 0.0, 0.0, 0.0
     for j in range(len(depth)):
         offset = depth[j] - centre

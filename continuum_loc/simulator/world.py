@@ -1,6 +1,7 @@
 """
-The simulated world: a robot in a scene, driven along a trajectory, and every sensor's samples with
-the truth.
+The simulated world.
+
+A robot in a scene, driven along a trajectory, and every sensor's samples with the truth.
 
     world = World(load_robot("engine"), load_scene("S0"), "t1")
     for sample in world.run(20.0):
@@ -91,8 +92,9 @@ class World:
 
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
         """
-        Samples of the first `duration` seconds (default: the trajectory's), in the order of their
-        stamps.
+        Yield samples of the first `duration` seconds, in the order of their stamps.
+
+        The default is the trajectory's duration.
 
         Every call starts again from rest. Raises model.SimulationDiverged.
         """
@@ -245,7 +247,11 @@ class _Body:
         self._steps = 0
 
     def settle(self) -> None:
-        """Bring the robot to rest under the first command, from straight; time 0 is then the trajectory's start."""
+        """
+        Bring the robot to rest under the first command, from straight.
+
+        Time 0 is then the trajectory's start.
+        """
         mujoco, model, data = self._mujoco, self.model, self.data
         mujoco.mj_resetData(model, data)
         self._command(0.0)
@@ -256,7 +262,7 @@ class _Body:
         self._steps = 0
 
     def resting_states(self) -> list[State]:
-        """The states at -1, 0 and +1 steps: motion is defined from time 0 on."""
+        """Return the states at -1, 0 and +1 steps: motion is defined from time 0 on."""
         first = self.step()
         before = State(
             -self.model.opt.timestep,
@@ -269,8 +275,9 @@ class _Body:
 
     def step(self) -> State:
         """
-        The state at the next step's beginning; then the drives' new command acts and the step is
-        taken.
+        Return the state at the next step's beginning; then take the step.
+
+        Before it is taken, the drives' new command acts.
 
         MuJoCo's derived quantities after a step still belong to its beginning, so no extra
         kinematics are needed.
