@@ -1,6 +1,7 @@
 """
-The filter on the engine robot at full sensor rate: 16 ToF of 64 zones, 5 gyros, strain; on one
-core.
+The filter on the engine robot at full sensor rate, on one core.
+
+16 ToF of 64 zones, 5 gyros, strain.
 
 `run(quick)` gives the time per second of data and the percentiles of a step, over trajectory t2 in
 S0, and what a step costs with longer windows, more nodes and larger maps. Nothing comparable

@@ -33,7 +33,11 @@ Query = Callable[[np.ndarray], object]
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s, peer, peer_s (seconds per lookup), ratio (peer / ours) and spread (its quartiles)."""
+    """
+    Rows of name, ours_s, peer, peer_s, ratio (peer / ours) and spread (its quartiles).
+
+    Times are seconds per lookup.
+    """
     prior = _engine_map(MAP_POINTS // (10 if quick else 1))
     repeats = 5 if quick else 15
     index = prior.index(reach=MAX_DISTANCE)
@@ -71,7 +75,11 @@ def run(quick: bool = False) -> list[dict]:
 
 
 def scaling(quick: bool = False) -> list[dict]:
-    """Rows of points, build_s, first_visit_s and lookup_s (seconds per lookup, filter frames), index_bytes."""
+    """
+    Rows of points, build_s, first_visit_s, lookup_s and index_bytes.
+
+    Times are seconds per lookup, in filter frames.
+    """
     rows = []
     for count in (5_000, 50_000, 500_000) if quick else (5_000, 50_000, 500_000, 5_000_000):
         prior = _random_map(count)
@@ -112,7 +120,11 @@ def _engine_map(count: int) -> PriorMap:
 
 
 def _random_map(count: int) -> PriorMap:
-    """As many random points on the engine: much faster to make than blue noise, and the index does not care."""
+    """
+    As many random points on the engine.
+
+    Much faster to make than blue noise, and the index does not care.
+    """
     import trimesh
 
     mesh = trimesh.Trimesh(*_engine_mesh(), process=False)
@@ -136,7 +148,11 @@ def _filter_frames(prior: PriorMap, frames: int, iterations: int = 3) -> list[np
 
 
 def _filter_zones(prior: PriorMap) -> tuple[np.ndarray, np.random.Generator]:
-    """(1024, 3) places where the zones of 16 sensors, each seeing a patch of 0.25 m radius, hit the map at first."""
+    """
+    (1024, 3) places where the zones of 16 sensors hit the map at first.
+
+    Each sensor sees a patch of 0.25 m radius.
+    """
     from scipy.spatial import cKDTree
 
     rng = np.random.default_rng(0)
@@ -204,7 +220,11 @@ def _kiss_icp_peer(prior: PriorMap, voxel: float = 0.03) -> Iterator[tuple[str, 
 
 
 def _ask(query: Query, batches: list[np.ndarray]) -> float:
-    """Seconds of processor time per lookup: on one core that is what one waits for, without what others do to it."""
+    """
+    Seconds of processor time per lookup.
+
+    On one core that is what one waits for, without what others do to it.
+    """
     started = time.process_time()
     for batch in batches:
         query(batch)

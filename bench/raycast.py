@@ -1,6 +1,7 @@
 """
-One frame of ToF rays against an engine of 150,000 faces, beside MuJoCo's own ray casters and
-Open3D.
+One frame of ToF rays against an engine of 150,000 faces.
+
+Beside MuJoCo's own ray casters and Open3D.
 
 `run(quick)` gives a list of rows, each ours against one peer on one workload, on one core,
 alternating the two:
@@ -29,7 +30,11 @@ Action = Callable[[], object]
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s, peer, peer_s (seconds per frame), ratio (peer / ours) and spread (its quartiles)."""
+    """
+    Rows of name, ours_s, peer, peer_s, ratio (peer / ours) and spread (its quartiles).
+
+    Times are seconds per frame.
+    """
     scene = engine_scene()
     caster, model, data = RayCaster(scene), *_mujoco_scene(scene)
     frame, repeats, rows = _fans(1), 2 if quick else 10, []
@@ -183,7 +188,11 @@ def _rangefinders(scene: Scene, origins: np.ndarray, rays: np.ndarray) -> Action
 
 
 def _body(origins: np.ndarray, rays: np.ndarray) -> tuple[Action, str, Action]:
-    """The robot's 150 links as capsules: our kernel beside mj_multiRay on as many capsule geoms."""
+    """
+    Cast to the robot's 150 links as capsules.
+
+    Our kernel beside mj_multiRay on as many capsule geoms.
+    """
     import mujoco
 
     robot = load_robot('engine')
@@ -208,7 +217,7 @@ def _body(origins: np.ndarray, rays: np.ndarray) -> tuple[Action, str, Action]:
 
 
 def _compare(name: str, ours: Action, peer: str, theirs: Action, repeats: int) -> dict:
-    """Alternate the two; the median times, and the ratio's median and quartiles over the repeats."""
+    """Alternate the two: median times, and the ratio's median and quartiles over the repeats."""
     ours(), theirs()
     times = np.array([(_seconds(ours), _seconds(theirs)) for _ in range(repeats)])
     ratio = times[:, 1] / times[:, 0]

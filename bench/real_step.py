@@ -1,6 +1,7 @@
 """
-One step of the filter on a recorded trial: 5 nodes and 4 knots, covariance included, beside the
-published figure.
+One step of the filter on a recorded trial, beside the published figure.
+
+5 nodes and 4 knots, covariance included.
 
 The trial is found through CONTINUUM_LOC_DATA; without it there are no rows. The published C++
 code's 20 ms (19-21) are its authors' figure from another machine, so there is no ratio against it,
@@ -24,7 +25,7 @@ NODES, KNOTS = 5, 4
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s (the median over steps, in seconds) and p95_s; there is no peer to run."""
+    """Rows of name, ours_s (median over steps, in seconds) and p95_s; there is no peer to run."""
     if not BOUNDS:
         return []
     from continuum_loc.evaluation.studies.real import data_folder, estimates, ROBOT

@@ -1,6 +1,7 @@
 """
-Shape from Hall sensors and IMUs: a whole estimate, and three positions beside SciPy's bounded
-minimisers.
+Shape from Hall sensors and IMUs.
+
+A whole estimate, and three positions beside SciPy's bounded minimisers.
 
 `run(quick)` gives a list of rows:
 - *shape, whole estimate*: what one estimate of the online estimator costs, the samples of three
@@ -40,7 +41,11 @@ Solve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s, peer, peer_s (seconds), ratio (peer / ours), spread (its quartiles) and agreement_m."""
+    """
+    Rows of name, ours_s, peer, peer_s, ratio (peer / ours), spread and agreement_m.
+
+    Times are in seconds; the spread is the ratio's quartiles.
+    """
     robot = load_robot('hall_arm')
     solver = PositionSolver(
         robot.magnet, np.array([robot.sensor_arclength(sensor.name) for sensor in robot.hall])
@@ -61,7 +66,11 @@ def run(quick: bool = False) -> list[dict]:
 
 
 def _whole_estimate(robot: RobotDescription, repeats: int) -> dict:
-    """Median over the estimates at the IMU's own rate, on the way from straight into a groove and resting there."""
+    """
+    Median over the estimates at the IMU's own rate.
+
+    On the way from straight into a groove and resting there.
+    """
     arm = Arm(robot, seed=0)
     samples = arm.record(groove_motion(arm, bent(robot, 12.5)))
     times = []
@@ -90,7 +99,11 @@ def _whole_estimate(robot: RobotDescription, repeats: int) -> dict:
 
 
 def _problems(robot: RobotDescription, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Fields (3, 3) [T] of noisy modules in the magnet's frame, and starts (3, 3) [m] some millimetres off."""
+    """
+    Fields (3, 3) [T] of noisy modules in the magnet's frame, and starts (3, 3) [m].
+
+    The starts are some millimetres off.
+    """
     rng = np.random.default_rng(0)
     arm = Arm(robot, seed=0)
     for k in range(count):
@@ -166,7 +179,11 @@ def _compare(
     problems: list[tuple[np.ndarray, np.ndarray]],
     repeats: int,
 ) -> dict:
-    """Alternate ours and the peer's over all problems; ours repeats them, being quicker than the clock's noise."""
+    """
+    Alternate ours and the peer's over all problems.
+
+    Ours repeats them, being quicker than the clock's noise.
+    """
     gaps = [
         np.linalg.norm(solver.solve(*problem).position - theirs(*problem), axis=1).max()
         for problem in problems

@@ -57,7 +57,11 @@ Settings = Annotated[
 
 
 def main() -> None:
-    """Entry point: errors of our own are told in one line, anything else is a bug and keeps its traceback."""
+    """
+    Entry point of the command.
+
+    Errors of our own are told in one line, anything else is a bug and keeps its traceback.
+    """
     try:
         app()
     except Exception as error:
@@ -77,8 +81,7 @@ def demo(
     out: Runs = Path('runs'),
 ) -> None:
     """
-    The whole path: simulator and estimator live over ROS 2, a bag, a report, and the same again
-    from the bag.
+    Simulate and estimate live over ROS 2 into a bag and a report, and once more from the bag.
 
     Example: `continuum-loc demo --trajectory t2 --duration 10`
     """
@@ -174,8 +177,9 @@ def replay(
     out: Runs = Path('runs'),
 ) -> None:
     """
-    Localise from a recorded bag without a ROS graph; the same bag gives the same estimate, bit for
-    bit.
+    Localise from a recorded bag without a ROS graph.
+
+    The same bag gives the same estimate, bit for bit.
 
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
@@ -224,8 +228,9 @@ def shape(
     out: Runs = Path('runs'),
 ) -> None:
     """
-    Estimate the shape from Hall sensors and IMUs of a recorded bag; the robot rests while it
-    begins.
+    Estimate the shape from Hall sensors and IMUs of a recorded bag.
+
+    The robot rests while it begins.
 
     Example: `continuum-loc shape bench_top.mcap --robot my_arm.yaml`
     """
@@ -265,8 +270,9 @@ def tune(
     jobs: Annotated[int, typer.Option(help='processes', min=1)] = 1,
 ) -> None:
     """
-    Sweep process and measurement noise on a hold-out bag, by error and by consistency, and write
-    what is best.
+    Sweep process and measurement noise on a hold-out bag, and write what is best.
+
+    It is judged by error and by consistency.
 
     Example: `continuum-loc tune my_settings.yaml --bag hold_out --map my_map.npz --jobs 2`
     """
@@ -367,8 +373,9 @@ def evaluate(
     settings: Settings = None,
 ) -> None:
     """
-    Run a study and compare its figures with their bounds; the exit code is 1 where one does not
-    hold.
+    Run a study and compare its figures with their bounds.
+
+    The exit code is 1 where one does not hold.
 
     An interrupted study continues where it stopped when its `--out` is given again.
 
@@ -534,7 +541,7 @@ def _write_report(folder: Path) -> Path:
 
 
 def _run_table(summary: dict[str, Any]) -> Any:
-    """The short table at the end of a run: one line per ring, then speed."""
+    """Print the short table at the end of a run: one line per ring, then speed."""
     from rich.table import Table
 
     def cells(entry: dict[str, Any]) -> list[str]:
@@ -608,7 +615,7 @@ def _figure(value: float | None, scale: float = 1.0) -> str:
 
 
 def _busy() -> Any:
-    """A spinner whose text says what is going on."""
+    """Show a spinner whose text says what is going on."""
     return errors.status('')
 
 

@@ -62,7 +62,7 @@ INVERSE_SERIES = np.array(
 
 
 def hat(v: np.ndarray) -> np.ndarray:
-    """Skew matrix (..., 3, 3) with hat(v) w = v x w (paper eq. 6)."""
+    """Skew matrix W (..., 3, 3) of v (..., 3), with W w = v x w (paper eq. 6)."""
     v = np.asarray(v, float)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
@@ -97,7 +97,7 @@ def so3_log(R: np.ndarray) -> np.ndarray:
 
 
 def _quaternion(R: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4), w first, by the largest of four equivalent forms."""
+    """Convert to unit quaternions (..., 4), w first, by the largest of four equivalent forms."""
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     d, e, f = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
@@ -116,7 +116,7 @@ def _quaternion(R: np.ndarray) -> np.ndarray:
 
 
 def exp(xi: np.ndarray) -> np.ndarray:
-    """Transforms (..., 4, 4) of se(3) vectors (..., 6)."""
+    """Exponential map: transforms (..., 4, 4) of se(3) vectors (..., 6)."""
     xi = np.asarray(xi, float)
     T = np.zeros((*xi.shape[:-1], 4, 4))
     T[..., :3, :3] = so3_exp(xi[..., 3:])
@@ -144,13 +144,13 @@ def inverse(T: np.ndarray) -> np.ndarray:
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:
-    """(..., 6, 6) with T exp(xi) T^-1 = exp(adjoint(T) xi)."""
+    """Adjoint matrix A (..., 6, 6) of a transform: T exp(xi) T^-1 = exp(A xi)."""
     R = T[..., :3, :3]
     return _block(R, hat(T[..., :3, 3]) @ R)
 
 
 def ad(xi: np.ndarray) -> np.ndarray:
-    """(..., 6, 6) Lie bracket: ad(x) y = [x, y]."""
+    """Matrix (..., 6, 6) of the Lie bracket with x: times y it is [x, y]."""
     xi = np.asarray(xi, float)
     return _block(hat(xi[..., 3:]), hat(xi[..., :3]))
 
@@ -164,7 +164,7 @@ def left_jacobian(xi: np.ndarray) -> np.ndarray:
 
 
 def right_jacobian(xi: np.ndarray) -> np.ndarray:
-    """(..., 6, 6) right Jacobian of SE(3): exp(xi + d) = exp(xi) exp(right_jacobian(xi) d)."""
+    """J_r (..., 6, 6), right Jacobian of SE(3): exp(xi + d) = exp(xi) exp(J_r d)."""
     return left_jacobian(-np.asarray(xi, float))
 
 
@@ -220,7 +220,11 @@ def _polynomial(xi: np.ndarray, coefficients: tuple[np.ndarray, ...]) -> np.ndar
 
 
 def _left_coefficients(angle: np.ndarray) -> list[np.ndarray]:
-    """c1..c4 of J_l = I + c1 A + c2 A^2 + c3 A^3 + c4 A^4 (Barfoot, State Estimation for Robotics, eq. 7.83)."""
+    """
+    c1..c4 of J_l = I + c1 A + c2 A^2 + c3 A^3 + c4 A^4.
+
+    Barfoot, State Estimation for Robotics, eq. 7.83.
+    """
     small = angle < SMALL_ANGLE
     f = np.where(small, 1.0, angle)
     s, c = np.sin(f), np.cos(f)
@@ -237,7 +241,11 @@ def _left_coefficients(angle: np.ndarray) -> list[np.ndarray]:
 
 
 def _inverse_coefficients(angle: np.ndarray) -> list[np.ndarray]:
-    """a, b of J_l^-1 = I - A/2 + a A^2 + b A^4, from h(phi) = (phi/2) cot(phi/2) and its derivative at +-i phi."""
+    """
+    Compute a, b of J_l^-1 = I - A/2 + a A^2 + b A^4.
+
+    From h(phi) = (phi/2) cot(phi/2) and its derivative at +-i phi.
+    """
     small = angle < SMALL_ANGLE
     f = np.where(small, 1.0, angle)
     half = 0.5 * f

@@ -35,7 +35,7 @@ def _hat_into(out, row, column, x, y, z):
 
 @njit(cache=True)
 def ad(x, out):
-    """Out (6, 6) = ad(x) of x (6,)."""
+    """Adjoint matrix of x (6,) in se(3), into out (6, 6)."""
     _hat_into(out, 0, 0, x[3], x[4], x[5])
     _hat_into(out, 3, 3, x[3], x[4], x[5])
     _hat_into(out, 0, 3, x[0], x[1], x[2])
@@ -92,7 +92,7 @@ def apply(A, x, out):
 
 @njit(cache=True)
 def exp(x, T):
-    """T (4, 4) = exp(x)."""
+    """Exponential of x, into T (4, 4)."""
     a, b, c = x[3], x[4], x[5]
     square = a * a + b * b + c * c
     angle = math.sqrt(square)
@@ -125,7 +125,11 @@ def exp(x, T):
 
 @njit(cache=True)
 def log(T, x):
-    """X (6,) = log(T), angle in [0, pi], through the quaternion whose largest component divides."""
+    """
+    Logarithm of T, into x (6,), angle in [0, pi].
+
+    Through the quaternion whose largest component divides.
+    """
     xx, yy, zz = T[0, 0], T[1, 1], T[2, 2]
     a, b, c = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
     trace = xx + yy + zz
@@ -236,7 +240,11 @@ def right_coefficients(x, c, dc):
 
 @njit(cache=True)
 def right_inverse_coefficients(x, c, dc):
-    """C (5,): J_r(x)^-1 = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
+    """
+    Coefficients c (5,) of J_r(x)^-1 = sum c_i ad(x)^i, and dc (5,).
+
+    dc: derivative of each by the angle phi, over phi.
+    """
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0], c[1], c[3] = 1.0, 0.5, 0.0
@@ -258,7 +266,11 @@ def right_inverse_coefficients(x, c, dc):
 
 @njit(cache=True)
 def polynomial(c, A, out, work):
-    """Out = c0 I + c1 A + ... + c4 A^4 by Horner's rule, A of the form [[X, Y], [0, X]]; work (6, 6)."""
+    """
+    Out = c0 I + c1 A + ... + c4 A^4 by Horner's rule.
+
+    A of the form [[X, Y], [0, X]]; work (6, 6).
+    """
     out[:, :] = 0.0
     for i in range(6):
         out[i, i] = c[4]
@@ -325,5 +337,9 @@ def _subtract_ad(D, x):
 
 @njit(cache=True)
 def workspace():
-    """Scratch that the functions above and the interpolation share: allocate once outside a loop."""
+    """
+    Scratch that the functions above and the interpolation share.
+
+    Allocate it once outside a loop.
+    """
     return np.zeros((12, 6, 6)), np.zeros((16, 6)), np.zeros((4, 4, 4))

@@ -1,6 +1,7 @@
 """
-Stamped sensor samples, as plain arrays: what `msg_tools` makes of messages and the estimator
-consumes.
+Stamped sensor samples, as plain arrays.
+
+They are what `msg_tools` makes of messages and the estimator consumes.
 
 Stamps are integer nanoseconds of the sensor's own clock (the message header), never the arrival
 time. All arrays are SI. Nothing here knows ROS.
@@ -21,7 +22,11 @@ TOF_NO_TARGET = 255
 
 
 def seconds(stamp: int, epoch: int = 0) -> float:
-    """Seconds from `epoch` to `stamp`, both in integer nanoseconds (exact to 1 ns over days)."""
+    """
+    Time [s] from `epoch` to `stamp`, both in integer nanoseconds.
+
+    Exact to 1 ns over days.
+    """
     return (stamp - epoch) / NANOSECONDS
 
 
@@ -54,7 +59,11 @@ class TofFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
-    """Angular velocity (3,) rad/s and specific force (3,) m/s^2 (+g at rest) in the IMU's frame."""
+    """
+    Angular velocity (3,) rad/s and specific force (3,) m/s^2 in the IMU's frame.
+
+    The force is +g at rest.
+    """
 
     stamp: int
     sensor: str
@@ -65,8 +74,9 @@ class ImuSample:
 @dataclass(frozen=True, slots=True, eq=False)
 class StrainSample:
     """
-    Bending at M stations: arclength s (M,) m, bending-plane angle theta (M,) rad, curvature kappa
-    (M,) 1/m.
+    Bending at M stations.
+
+    Arclength s (M,) m, bending-plane angle theta (M,) rad, curvature kappa (M,) 1/m.
 
     As in the paper's eqs. 7-8 the strain is Ad(Rx(theta)) [1 0 0 0 0 kappa]: the rotational strain
     is kappa * (0, -sin theta, cos theta).
@@ -90,9 +100,10 @@ class FieldSample:
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPose:
     """
-    An external tracker's pose of a sensor: T_map_sensor (4, 4), covariance (6, 6) in [rho; phi]
-    order of a right (sensor-frame) perturbation; all-zero covariance means the tracker states
-    none.
+    An external tracker's pose of a sensor.
+
+    T_map_sensor (4, 4), covariance (6, 6) in [rho; phi] order of a right (sensor-frame)
+    perturbation; all-zero covariance means the tracker states none.
     """
 
     stamp: int
@@ -103,7 +114,11 @@ class TrackedPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncoderSample:
-    """Joint states by name: tendon displacements (m) and forces (N), base insertion (m, name `insertion`)."""
+    """
+    Joint states by name.
+
+    Tendon displacements (m) and forces (N), base insertion (m, name `insertion`).
+    """
 
     stamp: int
     names: tuple[str, ...]
@@ -113,7 +128,11 @@ class EncoderSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthSample:
-    """True poses in `map`: T_map_ring (R + 1, 4, 4), the base first, then the rings in the robot's order."""
+    """
+    True poses in `map`.
+
+    T_map_ring (R + 1, 4, 4), the base first, then the rings in the robot's order.
+    """
 
     stamp: int
     T_map_ring: np.ndarray

@@ -27,8 +27,10 @@ Vector6 = tuple[float, float, float, float, float, float]
 
 class Mount(Settings):
     """
-    Where a sensor sits on its ring: either `azimuth_deg` and `radius` (radial, looking outward),
-    or `xyz` (m) and `rpy_deg` (fixed-axis roll, pitch, yaw) in the ring's frame.
+    Where a sensor sits on its ring.
+
+    Either `azimuth_deg` and `radius` (radial, looking outward), or `xyz` (m) and `rpy_deg`
+    (fixed-axis roll, pitch, yaw) in the ring's frame.
     """
 
     azimuth_deg: float | None = Field(
@@ -157,8 +159,9 @@ class TofModel(Settings):
     @cached_property
     def directions(self) -> np.ndarray:
         """
-        (rows * columns, 3) unit rays in the sensor frame (x optical axis), row-major; columns step
-        along sensor y, rows along sensor z.
+        (rows * columns, 3) unit rays in the sensor frame (x optical axis), row-major.
+
+        Columns step along sensor y, rows along sensor z.
         """
         half = np.radians(self.fov_deg) / 2.0
 
@@ -173,7 +176,7 @@ class TofModel(Settings):
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def sigma(self, ranges: np.ndarray) -> np.ndarray:
-        """Standard deviation [m] of a measured distance [m], Table I (same shape)."""
+        """Give the standard deviation [m] of a measured distance [m], Table I (same shape)."""
         return np.interp(ranges, self.noise_distance, self.noise_coefficient) * ranges
 
 
@@ -290,14 +293,22 @@ class RobotDescription(Settings):
 
     @cached_property
     def strain_stations(self) -> np.ndarray:
-        """(M,) arclengths of the strain stations [m]: half a spacing from the base, then every spacing."""
+        """
+        (M,) arclengths of the strain stations [m].
+
+        Half a spacing from the base, then every spacing.
+        """
         if self.strain is None:
             return np.empty(0)
         spacing = self.strain.spacing
         return np.arange(spacing / 2.0, self.length, spacing)
 
     def sensor(self, name: str) -> Sensor:
-        """The sensor called `name`. Raises KeyError listing the valid names."""
+        """
+        Return the sensor called `name`.
+
+        Raises KeyError listing the valid names.
+        """
         for sensor in self.sensors:
             if sensor.name == name:
                 return sensor
@@ -312,5 +323,9 @@ class RobotDescription(Settings):
 
 
 def load_robot(name_or_path: str | Path) -> RobotDescription:
-    """A robot that comes with the package (`engine`, `soft_arm`, `hall_arm`), or one of your own from a YAML file."""
+    """
+    Load a robot that comes with the package, or one of your own from a YAML file.
+
+    The package has `engine`, `soft_arm` and `hall_arm`.
+    """
     return load_bundled(RobotDescription, ROBOTS_FOLDER, name_or_path, 'robot')

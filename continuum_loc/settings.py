@@ -17,7 +17,11 @@ import yaml
 
 
 class SettingsError(ValueError):
-    """A settings file or mapping that cannot be used; the message says what, where and what is valid."""
+    """
+    A settings file or mapping that cannot be used.
+
+    The message says what, where and what is valid.
+    """
 
 
 class Settings(BaseModel):
@@ -47,7 +51,7 @@ def load_settings(model: type[S], path: str | Path) -> S:
 
 def load_bundled(model: type[S], folder: Path, name_or_path: str | Path, what: str) -> S:
     """
-    Settings that come with the package as `folder/NAME.yaml`, or from a YAML file of one's own.
+    Load settings from the package's `folder/NAME.yaml`, or from a YAML file of one's own.
 
     what: what it is, for the error. Raises SettingsError listing the names that there are.
     """

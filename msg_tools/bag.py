@@ -23,7 +23,7 @@ _CLOUDS = ('reconstruction', 'prior_map')
 
 
 def _qos(topic: Topic) -> Any:
-    """The QoS that our publishers offer: reliable, and kept for late joiners where latched."""
+    """Return the QoS that our publishers offer: reliable, and kept for late joiners if latched."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,
@@ -94,7 +94,11 @@ class BagWriter:
         self.write_raw(topic, bytes(typestore().serialize_cdr(message, spec.type)), stamp)
 
     def write_raw(self, topic: str, data: bytes, stamp: int) -> None:
-        """Write an already serialised message (CDR with its 4-byte head) of a topic of the contract."""
+        """
+        Write an already serialised message of a topic of the contract.
+
+        CDR with its 4-byte head.
+        """
         connection = self._connections.get(topic) or self._connect(topic)
         self._writer.write(connection, stamp, data)
 
@@ -114,8 +118,9 @@ def read_bag(
     on_error: Callable[[str, ConvertError], None] | None = None,
 ) -> Iterator[tuple[str, Any]]:
     """
-    (relative topic, measurement, truth or record) of a bag folder or file, in the order of the
-    log.
+    (relative topic, measurement, truth or record) of a bag, in the order of the log.
+
+    The bag is a folder or a file.
 
     topics: only these (`tracker/` for all trackers). namespace: whose topics, where several robots
     are in the bag; None or empty takes the only one.
@@ -136,7 +141,11 @@ def read_bag(
 def raw_messages(
     path: str | Path, topics: tuple[str, ...] | None = None, namespace: str | None = None
 ) -> Iterator[tuple[str, int, bytes]]:
-    """(relative topic, log time in ns, serialised message) of a bag, as `read_bag` selects them."""
+    """
+    (relative topic, log time in ns, serialised message) of a bag.
+
+    Selected as `read_bag` does.
+    """
     path = Path(path)
     with open_bag(path) as reader:
         names = contract_topics(path, reader.connections, namespace)
@@ -153,7 +162,11 @@ def raw_messages(
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """An opened rosbags reader. Raises BagError naming the file."""
+    """
+    Open a rosbags reader.
+
+    Raises BagError naming the file.
+    """
     from rosbags.rosbag2 import Reader
 
     if not path.exists():
@@ -197,7 +210,11 @@ def contract_topics(path: Path, connections: list, namespace: str | None) -> dic
 
 
 def split_topic(name: str, type_name: str) -> tuple[str, str] | None:
-    """(namespace, relative topic) of an absolute name, or None outside the contract; '*' owns the absolute topics."""
+    """
+    (namespace, relative topic) of an absolute name, or None outside the contract.
+
+    '*' owns the absolute topics.
+    """
     if name in TOPICS:
         return ('*', name) if TOPICS[name].type == type_name else None
     parts = name.strip('/').split('/')

@@ -65,7 +65,7 @@ def cloud_array(message: Any, where: str) -> np.ndarray:
 
 
 def cloud_dtype(message: Any, where: str) -> np.dtype:
-    """The structured dtype which the cloud's fields describe."""
+    """Make the structured dtype which the cloud's fields describe."""
     order = '>' if message.is_bigendian else '<'
     step = int(message.point_step)
     names, formats, offsets = [], [], []

@@ -75,7 +75,7 @@ def stamp_of(header: Any, where: str) -> int:
 
 def frame_of(header: Any, where: str) -> str:
     """
-    The header's frame without a leading slash (tf1's habit).
+    Return the header's frame without a leading slash (tf1's habit).
 
     Raises ConvertError where it is empty.
     """
@@ -93,7 +93,11 @@ def _require_map(header: Any, where: str) -> None:
 
 
 def pose_message(make: Messages, T: np.ndarray, quaternion: np.ndarray | None = None) -> Any:
-    """geometry_msgs/Pose of a (4, 4) transform; pass the quaternion (x, y, z, w) where it is known already."""
+    """
+    geometry_msgs/Pose of a (4, 4) transform.
+
+    Pass the quaternion (x, y, z, w) where it is known already.
+    """
     x, y, z, w = (
         Rotation.from_matrix(T[:3, :3]).as_quat() if quaternion is None else quaternion
     ).tolist()
@@ -143,7 +147,11 @@ def transforms_of(poses: list, where: str) -> np.ndarray:
 
 
 def ros_covariance(covariance: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """(36,) row-major covariance about the map's axes, of a (6, 6) one about the body's (REP-103)."""
+    """
+    (36,) row-major covariance about the map's axes, of a (6, 6) one about the body's.
+
+    REP-103.
+    """
     turn = np.kron(np.eye(2), R)
     return (turn @ covariance @ turn.T).reshape(36)
 
@@ -193,7 +201,7 @@ def tof_message(make: Messages, frame: TofFrame) -> Any:
 
 def tof_frame(message: Any, where: str = 'tof/points') -> TofFrame:
     """
-    The ToF frame of a PointCloud2 with at least x, y, z.
+    Read the ToF frame of a PointCloud2 with at least x, y, z.
 
     Absent fields are filled: `range` from the points (nan where there is none), `sigma` with nan,
     `status` with 5 where a range is finite and 255 elsewhere. Raises ConvertError on another
@@ -263,7 +271,11 @@ def _octets(status: np.ndarray, where: str) -> np.ndarray:
 
 
 def imu_message(make: Messages, sample: ImuSample) -> Any:
-    """Imu without orientation (REP-145: a covariance that begins with -1), and a gyro alone without acceleration."""
+    """
+    Write an Imu without orientation, and a gyro alone without acceleration.
+
+    REP-145: a covariance that begins with -1.
+    """
     absent = np.zeros(9)
     absent[0] = -1.0
     gyro_alone = np.isnan(sample.linear_acceleration).all()
@@ -282,7 +294,11 @@ def imu_message(make: Messages, sample: ImuSample) -> Any:
 
 
 def imu_sample(message: Any, where: str = 'imu/data_raw') -> ImuSample:
-    """The IMU sample of an Imu message; a gyro alone (linear_acceleration_covariance[0] = -1) has nan acceleration."""
+    """
+    Read the IMU sample of an Imu message.
+
+    A gyro alone (linear_acceleration_covariance[0] = -1) has nan acceleration.
+    """
     if message.angular_velocity_covariance[0] == -1.0:
         raise ConvertError(
             'value', f'{where}: angular_velocity_covariance[0] = -1 says that there is no gyro'
@@ -307,7 +323,7 @@ def field_message(make: Messages, sample: FieldSample) -> Any:
 
 
 def field_sample(message: Any, where: str = 'imu/mag') -> FieldSample:
-    """The Hall sample of a MagneticField message."""
+    """Read the Hall sample of a MagneticField message."""
     value = _vector(message.magnetic_field)
     if np.isinf(value).any():
         raise ConvertError(
@@ -321,7 +337,11 @@ def field_sample(message: Any, where: str = 'imu/mag') -> FieldSample:
 
 
 def strain_message(make: Messages, sample: StrainSample) -> Any:
-    """Float64MultiArray: data[0] the stamp in seconds (good to 0.3 us in this century), then rows (s, theta, kappa)."""
+    """
+    Float64MultiArray: data[0] the stamp in seconds, then rows (s, theta, kappa).
+
+    The stamp is good to 0.3 us in this century.
+    """
     rows = np.column_stack([sample.s, sample.theta, sample.kappa])
     data = np.concatenate([[sample.stamp / NANOSECONDS], rows.reshape(-1)])
     sizes = ((len(rows), rows.size), (3, 3))
@@ -339,7 +359,11 @@ def strain_is_stamped(message: Any) -> bool:
 
 
 def strain_sample(message: Any, arrival: int | None = None, where: str = 'strain') -> StrainSample:
-    """The strain of a Float64MultiArray; `arrival` (ns) is the stamp of one with data_offset = 0."""
+    """
+    Read the strain of a Float64MultiArray.
+
+    `arrival` (ns) is the stamp of one with data_offset = 0.
+    """
     data = np.array(message.data, float)
     offset = int(message.layout.data_offset)
     if offset not in (0, 1):
@@ -385,7 +409,7 @@ def _strain_stamp(data: np.ndarray, offset: int, arrival: int | None, where: str
 
 
 def tracker_message(make: Messages, pose: TrackedPose) -> Any:
-    """PoseWithCovarianceStamped in `map`; the topic names the sensor."""
+    """Write a PoseWithCovarianceStamped in `map`; the topic names the sensor."""
     covariance = ros_covariance(pose.covariance, pose.T_map_sensor[:3, :3])
     return make(
         'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -399,7 +423,7 @@ def tracker_message(make: Messages, pose: TrackedPose) -> Any:
 
 
 def tracked_pose(message: Any, sensor: str, where: str = 'tracker') -> TrackedPose:
-    """The pose of `sensor`, from PoseWithCovarianceStamped in `map`."""
+    """Read the pose of `sensor`, from PoseWithCovarianceStamped in `map`."""
     _require_map(message.header, where)
     T = transforms_of([message.pose.pose], where)[0]
     covariance = body_covariance(message.pose.covariance, T[:3, :3], where)
@@ -407,7 +431,7 @@ def tracked_pose(message: Any, sensor: str, where: str = 'tracker') -> TrackedPo
 
 
 def encoder_message(make: Messages, sample: EncoderSample) -> Any:
-    """JointState with positions and efforts."""
+    """Write a JointState with positions and efforts."""
     return make(
         'sensor_msgs/msg/JointState',
         header=header_message(make, sample.stamp, ''),
@@ -419,7 +443,7 @@ def encoder_message(make: Messages, sample: EncoderSample) -> Any:
 
 
 def encoder_sample(message: Any, where: str = 'joint_states') -> EncoderSample:
-    """The encoders of a JointState; an empty `position` or `effort` becomes nan."""
+    """Read the encoders of a JointState; an empty `position` or `effort` becomes nan."""
     names = tuple(message.name)
     if not names:
         raise ConvertError('empty', f'{where}: no joint is named')
@@ -447,7 +471,7 @@ def _per_joint(values: Any, names: tuple[str, ...], what: str, where: str) -> np
 
 
 def poses_message(make: Messages, stamp: int, T_map_body: np.ndarray) -> Any:
-    """PoseArray in `map` of (N, 4, 4)."""
+    """Write a PoseArray in `map` of (N, 4, 4)."""
     return make(
         'geometry_msgs/msg/PoseArray',
         header=header_message(make, stamp, MAP),
@@ -456,13 +480,13 @@ def poses_message(make: Messages, stamp: int, T_map_body: np.ndarray) -> Any:
 
 
 def poses_record(message: Any, where: str = 'poses') -> PosesRecord:
-    """The poses of a PoseArray in `map`."""
+    """Read the poses of a PoseArray in `map`."""
     _require_map(message.header, where)
     return PosesRecord(stamp_of(message.header, where), transforms_of(message.poses, where))
 
 
 def truth_sample(message: Any, where: str = 'ground_truth/poses') -> TruthSample:
-    """The true ring poses of a PoseArray in `map`."""
+    """Read the true ring poses of a PoseArray in `map`."""
     record = poses_record(message, where)
     return TruthSample(record.stamp, record.T_map_body)
 
@@ -478,14 +502,18 @@ def path_message(make: Messages, stamp: int, T_map_backbone: np.ndarray) -> Any:
 
 
 def path_record(message: Any, where: str = 'backbone') -> PathRecord:
-    """The transforms of a Path in `map`."""
+    """Read the transforms of a Path in `map`."""
     _require_map(message.header, where)
     T = transforms_of([item.pose for item in message.poses], where)
     return PathRecord(stamp_of(message.header, where), T)
 
 
 def tip_message(make: Messages, tip: TipRecord, child_frame: str) -> Any:
-    """Odometry: pose and its covariance in `map`, twist and its covariance in the tip's own frame (REP-103)."""
+    """
+    Odometry: pose and its covariance in `map`, twist and its in the tip's own frame.
+
+    REP-103.
+    """
     covariance = ros_covariance(tip.covariance, tip.T_map_tip[:3, :3])
     twist = make(
         'geometry_msgs/msg/Twist',
@@ -510,7 +538,7 @@ def tip_message(make: Messages, tip: TipRecord, child_frame: str) -> Any:
 
 
 def tip_record(message: Any, where: str = 'tip') -> TipRecord:
-    """The tip of an Odometry message in `map`."""
+    """Read the tip of an Odometry message in `map`."""
     _require_map(message.header, where)
     T = transforms_of([message.pose.pose], where)[0]
     velocity = np.concatenate(
@@ -546,7 +574,7 @@ def cloud_record(message: Any, where: str = 'cloud') -> CloudRecord:
 
 
 def map_record(stamp: int, prior_map: Any) -> CloudRecord:
-    """The columns of `prior_map`: points, normals and planarity of a PriorMap."""
+    """Read the columns of `prior_map`: points, normals and planarity of a PriorMap."""
     values = np.column_stack([prior_map.points, prior_map.normals, prior_map.planarity])
     names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z', 'planarity')
     return CloudRecord(stamp, dict(zip(names, values.T, strict=True)))
@@ -584,7 +612,7 @@ def _level(make: Messages, level: int) -> Any:
 
 
 def diagnostics_record(message: Any, where: str = '/diagnostics') -> DiagnosticsRecord:
-    """The statuses of a DiagnosticArray."""
+    """Read the statuses of a DiagnosticArray."""
     statuses = tuple(
         (
             item.name,

@@ -1,6 +1,7 @@
 """
-From a sensor driver's raw fields to measurements: what a driver node of one's own calls before it
-publishes.
+From a sensor driver's raw fields to measurements.
+
+What a driver node of one's own calls before it publishes.
 
 frame = vl53l5cx_frame(robot.tof_model, "ring1_tof1", stamp, distance_mm, target_status,
 range_sigma_mm) publisher.publish(tof_message(ros_messages(), frame))
@@ -36,7 +37,9 @@ def vl53l5cx_frame(
     nb_target_detected: Sequence[int] | None = None,
 ) -> TofFrame:
     """
-    A frame of the VL53L5CX from its driver's arrays, one value per zone in the driver's order.
+    Make a frame of the VL53L5CX from its driver's arrays, one value per zone.
+
+    Values are in the driver's order.
 
     model: of the robot description. Its `convention` says what the raw distance means: this sensor
     reports the *perpendicular* distance. Its `flip_rows`, `flip_columns` undo the lens. stamp: ns
@@ -74,8 +77,9 @@ def ism330_sample(
     accel_mg_per_lsb: float,
 ) -> ImuSample:
     """
-    An IMU sample from the ISM330's (or LSM6's) raw registers and the sensitivities of its data
-    sheet.
+    Make an IMU sample from the ISM330's (or LSM6's) raw registers.
+
+    By the sensitivities of its data sheet.
 
     At +-500 dps the gyro's is 17.50 mdps per LSB, at +-4 g the accelerometer's 0.122 mg per LSB.
     """

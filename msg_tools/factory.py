@@ -33,7 +33,7 @@ class Messages:
     doubles: Callable[[np.ndarray], Any]
 
     def __call__(self, type_name: str, **fields: Any) -> Any:
-        """A message with all its fields given."""
+        """Make a message with all its fields given."""
         return self.resolve(type_name)(**fields)
 
 
@@ -55,7 +55,7 @@ def ros_messages() -> Messages:
 
 @cache
 def typestore():
-    """The type store of ROS 2 Jazzy's messages."""
+    """Return the type store of ROS 2 Jazzy's messages."""
     from rosbags.typesys import get_typestore, Stores
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -72,7 +72,7 @@ def bag_messages() -> Messages:
 
 def deserialize(data: bytes, type_name: str):
     """
-    The rosbags message of serialised bytes (CDR with its 4-byte head).
+    Deserialise the rosbags message of bytes (CDR with its 4-byte head).
 
     Raises rosbags' SerdeError and others.
 

@@ -25,7 +25,11 @@ class PathRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TipRecord:
-    """`tip`: T_map_tip (4, 4), body velocity (6,) [v; w], and both covariances (6, 6) as in `Estimate`."""
+    """
+    `tip`: T_map_tip (4, 4), body velocity (6,) [v; w], and both covariances (6, 6).
+
+    As in `Estimate`.
+    """
 
     stamp: int
     T_map_tip: np.ndarray
@@ -36,7 +40,11 @@ class TipRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudRecord:
-    """`reconstruction` or `prior_map`: one (N,) array per field of the cloud (`x`, `y`, `z`, ...)."""
+    """
+    `reconstruction` or `prior_map`: one (N,) array per field of the cloud.
+
+    Fields are `x`, `y`, `z`, ...
+    """
 
     stamp: int
     fields: dict[str, np.ndarray]

@@ -1,6 +1,7 @@
 """
-Recorded trials of a tendon-driven robot (CSV files of the University of Toronto) as measurements,
-truth and bags.
+Recorded trials of a tendon-driven robot as measurements, truth and bags.
+
+They are CSV files of the University of Toronto.
 
 A trial is a folder of CSV files: `sensor type:,<type>`, a header, then rows `timestamp (s),
 arclength (m), data...`:
@@ -40,21 +41,30 @@ VALUES = {'aurora': 6, 'vicon': 6, 'gyro': 3}
 
 
 class TrialError(ValueError):
-    """A trial's folder or file that cannot be used; the message says which, where and what is valid."""
+    """
+    A trial's folder or file that cannot be used.
+
+    The message says which, where and what is valid.
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
     """
-    A trial: measurements in the order of their stamps, and for each ring that motion capture saw
-    its stamps (K,) in ns and true poses T_map_ring (K, 4, 4).
+    A trial: measurements in the order of their stamps, and what motion capture saw.
+
+    For each ring that it saw: its stamps (K,) in ns and true poses T_map_ring (K, 4, 4).
     """
 
     measurements: list[Measurement]
     truth: dict[str, tuple[np.ndarray, np.ndarray]]
 
     def truth_samples(self, robot: RobotDescription) -> list[TruthSample]:
-        """The whole body wherever motion capture saw all rings at once (the base's pose is that of the ring there)."""
+        """
+        Yield the whole body wherever motion capture saw all rings at once.
+
+        The base's pose is that of the ring there.
+        """
         rings = [self._ring_at(robot, s) for s in (0.0, *robot.ring_arclengths)]
         stamps = set.intersection(*(set(self.truth[ring][0].tolist()) for ring in rings))
         index = {
@@ -90,7 +100,7 @@ class _File:
 
 def read_recording(folder: str | Path, robot: RobotDescription) -> Recording:
     """
-    A trial's folder, for the robot whose description says which sensor sits where.
+    Read a trial's folder, for the robot whose description says which sensor sits where.
 
     Raises TrialError.
     """

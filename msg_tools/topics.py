@@ -36,7 +36,7 @@ class Topic:
 
 
 def _read(decode: Callable[[Any, str], Any]) -> Callable[[Any, int | None, str], Any]:
-    """A decoder of messages that carry their own stamp."""
+    """Make a decoder of messages that carry their own stamp."""
     return lambda message, arrival, where: decode(message, where)
 
 
@@ -50,7 +50,7 @@ def _path(make: Messages, item: Any) -> Any:
 
 
 def tip_of(estimate: Any) -> TipRecord:
-    """The tip of an `Estimate`: its last ring."""
+    """Take the tip of an `Estimate`: its last ring."""
     if isinstance(estimate, TipRecord):
         return estimate
     return TipRecord(
@@ -138,7 +138,7 @@ OUTPUTS = (
 
 def topic_spec(name: str) -> Topic:
     """
-    The contract of a relative topic; `tracker/<sensor>` too.
+    Return the contract of a relative topic; `tracker/<sensor>` too.
 
     Raises ConvertError listing the valid names.
     """
@@ -153,7 +153,11 @@ def topic_spec(name: str) -> Topic:
 
 
 def cloud_topic_record(item: Any, stamp: int) -> CloudRecord:
-    """What `reconstruction` and `prior_map` are written from: a CloudRecord, a PriorMap or a Reconstruction."""
+    """
+    Gather what `reconstruction` and `prior_map` are written from.
+
+    A CloudRecord, a PriorMap or a Reconstruction.
+    """
     if isinstance(item, CloudRecord):
         return item
     if hasattr(item, 'normals'):

@@ -239,9 +239,10 @@ class Recovery:
 
     def _how_doubtful(self, share: float) -> float:
         """
-        1 while lost; while suspect and not yet searched, the less the worst ring's share, the nearer 1.
+        How much to doubt the body, 0 to 1.
 
-        Else 0.
+        1 while lost; while suspect and not yet searched, as far as the worst ring's share has
+        sunk; else 0.
         """
         if self._watch.lost:
             return 1.0

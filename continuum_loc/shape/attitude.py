@@ -60,7 +60,11 @@ class GravityFilter:
         self.rate = np.zeros(3)
 
     def update(self, stamp: int, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
-        """Carry the rotation to `stamp` with gyro (3,) [rad/s] and accel (3,) [m/s^2]; returns R_map_imu (3, 3)."""
+        """
+        Carry the rotation to `stamp` with gyro (3,) [rad/s] and accel (3,) [m/s^2].
+
+        Returns R_map_imu (3, 3).
+        """
         dt = seconds(stamp, self.stamp)
         gain = 1.0 - math.exp(-dt / self.settings.time_constant)
         rate = gyro - self.bias
@@ -81,14 +85,18 @@ class GravityFilter:
 
     @property
     def yaw_sigma(self) -> float:
-        """Standard deviation of the yaw [rad]: the start's, the gyro's random walk and its bias over time."""
+        """
+        Compute the standard deviation of the yaw [rad].
+
+        The start's, the gyro's random walk and its bias over time.
+        """
         elapsed = seconds(self.stamp, self._start)
         walk = self._gyro_sigma**2 * self._period * elapsed
         return math.sqrt(self._yaw_sigma**2 + walk + (self.settings.bias_sigma * elapsed) ** 2)
 
     @property
     def tilt_sigma(self) -> float:
-        """Standard deviation of either tilt angle [rad] in the steady state of the filter."""
+        """Compute the standard deviation of either tilt angle [rad] in the steady state."""
         tau = self.settings.time_constant
         gravity = (self._accel_sigma / GRAVITY) ** 2 * self._period / (2.0 * tau)
         gyro = (
@@ -178,12 +186,16 @@ class EulerFilter:
     def start(
         self, stamp: int, R_map_imu: np.ndarray, bias: np.ndarray, yaw_sigma: float = 0.0
     ) -> None:
-        """Begin at a known rotation with a gyro bias (3,) [rad/s], instead of at the first sample with yaw 0."""
+        """
+        Begin at a known rotation with a gyro bias (3,) [rad/s].
+
+        Without it: at the first sample with yaw 0.
+        """
         self.stamp, self.bias = stamp, np.array(bias, dtype=float)
         self.angles = Rotation.from_matrix(R_map_imu).as_euler('ZYX')[::-1].copy()
 
     def rotation_at(self, stamp: int) -> np.ndarray:
-        """The rotation of the last sample."""
+        """Return the rotation of the last sample."""
         return self.R_map_imu
 
     def update(self, stamp: int, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
@@ -218,7 +230,11 @@ class EulerFilter:
 
 
 def euler_rates(angles: np.ndarray, gyro: np.ndarray) -> np.ndarray:
-    """(3,) rates of roll, pitch, yaw [rad/s] from body rates, eq. 4; grows without bound at 90 deg of pitch."""
+    """
+    (3,) rates of roll, pitch, yaw [rad/s] from body rates, eq. 4.
+
+    They grow without bound at 90 deg of pitch.
+    """
     theta, phi, _ = angles
     sine, cosine, tangent = math.sin(theta), math.cos(theta), math.tan(phi)
     return np.array(

@@ -1,14 +1,15 @@
 """
-All modules at once: one smooth, inextensible backbone that explains every field and every
-attitude.
+All modules at once.
+
+One smooth, inextensible backbone that explains every field and every attitude.
 
 The backbone is a chain of arcs of constant twist and curvature, `PIECES` from each module to the
 next, so that arclengths hold exactly and neighbours share what they know. Against solving eq. 10
 module by module, a module whose field says little (far away, on the equatorial plane, saturated)
 is held by the others.
 
-    minimise  sum |R^T (B(p) + b_earth) - b|^2 / sigma^2          (field, module's frame; no attitude enters)
-            + sum |Log(R_imu^T R)|^2_P                              (attitude, yaw loose)
+    minimise  sum |R^T (B(p) + b_earth) - b|^2 / sigma^2      (field, module's frame; no attitude)
+            + sum |Log(R_imu^T R)|^2_P                        (attitude, yaw loose)
             + sum |strain - rest|^2 / sigma_rest^2 + sum |curvature step|^2 / sigma_step^2
 """
 
@@ -29,6 +30,8 @@ PIECES = 3
 @dataclass(frozen=True, slots=True, eq=False)
 class BackboneFit:
     """
+    The joint fit of all modules.
+
     T_base_module (M, 4, 4); covariance (M, 6, 6) of a right perturbation [rho; phi]; strain (N,
     3): twist and the two curvatures of the N = PIECES * M arcs [1/m]; cost: half the sum of
     squares; dimension: of the measurements in it; converged.
@@ -57,7 +60,11 @@ class BackboneSolver:
         model: FieldModel = 'ring',
         step_sigma: float = 15.0,
     ) -> None:
-        """step_sigma: how much the curvature changes from one module to the next, 1 sigma [1/m]."""
+        """
+        Set how much the curvature changes from one module to the next.
+
+        step_sigma: 1 sigma of the change [1/m].
+        """
         gaps = np.diff(np.asarray(arclengths, float), prepend=0.0)
         self.lengths = np.repeat(gaps / PIECES, PIECES)
         self.parameters = magnet_parameters(robot.magnet, model)
@@ -85,10 +92,11 @@ class BackboneSolver:
         start: np.ndarray | None = None,
     ) -> BackboneFit:
         """
-        Fit to field (M, 3) [T] in the modules' frames with sigma (M, 3) (inf drops a component),
-        the Earth's field (3,) [T] in the base frame, and attitudes R_base_module (M, 3, 3) with
-        information (M, 3, 3) [1/rad^2] in the modules' frames (zeros drop one). start: strain (N,
-        3) of an earlier fit.
+        Fit to the fields in the modules' frames and to their attitudes.
+
+        field (M, 3) [T] with sigma (M, 3) (inf drops a component), the Earth's field (3,) [T] in
+        the base frame, and attitudes R_base_module (M, 3, 3) with information (M, 3, 3) [1/rad^2]
+        in the modules' frames (zeros drop one). start: strain (N, 3) of an earlier fit.
         """
         strain = (
             np.tile(self.rest, (len(self.lengths), 1))
@@ -181,7 +189,11 @@ def _solve(
 
 @njit(cache=True)
 def _forward(strain, lengths):
-    """T_base_module (M, 4, 4), and its right-perturbation Jacobian by all strains, chain (M, 6, 3 N)."""
+    """
+    T_base_module (M, 4, 4), and its right-perturbation Jacobian by all strains.
+
+    The Jacobian is chain (M, 6, 3 N).
+    """
     arcs = lengths.size
     T = np.zeros((arcs, 4, 4))
     chain = np.zeros((arcs, 6, 3 * arcs))
@@ -247,7 +259,11 @@ def _normal(
 
 @njit(cache=True)
 def field_error(T_base_module, parameters, magnet_s, earth, measured, residual, J):
-    """Residual (3,) = R^T (B(p) + earth) - measured [T], and J (3, 6) by a right perturbation [rho; phi]."""
+    """
+    Residual (3,) = R^T (B(p) + earth) - measured [T], and its Jacobian J (3, 6).
+
+    By a right perturbation [rho; phi].
+    """
     R = T_base_module[:3, :3]
     p = T_base_module[:3, 3].copy()
     p[0] -= magnet_s

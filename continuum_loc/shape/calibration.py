@@ -32,7 +32,11 @@ ZERO: Vector3 = (0.0, 0.0, 0.0)
 
 
 class CalibrationError(ValueError):
-    """Rests that no calibration explains; the message says what is wrong with the robot or its wiring."""
+    """
+    Rests that no calibration explains.
+
+    The message says what is wrong with the robot or its wiring.
+    """
 
 
 class ModuleCalibration(Settings):
@@ -64,7 +68,7 @@ class Calibration(Settings):
     )
 
     def check(self, robot: RobotDescription) -> None:
-        """Raises SettingsError when this is another robot's calibration."""
+        """Raise SettingsError where this is another robot's calibration."""
         if len(self.modules) != len(robot.hall):
             raise SettingsError(
                 f"calibration of {len(self.modules)} modules, but robot '{robot.name}' has "
@@ -257,7 +261,11 @@ class _Problem:
         self.measured = 2 * self.accel.size
 
     def split(self, unknowns: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Physical accel offset, IMU turn, Hall offset, Hall turn (M, 3), Earth (3,), relative moment change."""
+        """
+        Physical accel offset, IMU turn, Hall offset, Hall turn, Earth, relative moment change.
+
+        The first four are (M, 3), Earth is (3,).
+        """
         x = unknowns * self.scale
         return (*x[:-4].reshape(4, self.modules, 3), x[-4:-1], x[-1])
 

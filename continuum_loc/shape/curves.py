@@ -31,7 +31,7 @@ def fit_curve(
     projected: bool = False,
     samples: int = 61,
 ) -> np.ndarray:
-    """(samples, 3) points along the curve of the named method, from the first of `points` to the last."""
+    """Fit (samples, 3) points along the curve of the named method, from first to last point."""
     forms = PROJECTED if projected else SPATIAL
     if method not in forms:
         raise ValueError(f"no curve '{method}'; valid: {', '.join(forms)}")
@@ -57,7 +57,11 @@ def project(vectors: np.ndarray) -> np.ndarray:
 
 
 def lift(planar: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(C, 3) curve points in space from the half plane (C, 2), eqs. 23-24 (summed over the points there are)."""
+    """
+    (C, 3) curve points in space from the half plane (C, 2), eqs. 23-24.
+
+    Summed over the points there are.
+    """
     total = np.hypot(points[:, 1], points[:, 2]).sum()
     wy, wz = points[:, 1:].sum(axis=0) / total if total > 0.0 else (1.0, 0.0)
     return np.column_stack([planar[:, 1], wy * planar[:, 0], wz * planar[:, 0]])
@@ -128,9 +132,11 @@ def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) 
 
 def kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
     """
-    The circle of least squares in the plane of least squares (SVD), where one arc explains the
-    points; else a chain of biarcs through points and tangents, which is still arcs, but as many as
-    an S-shape needs.
+    Fit a circle of least squares, or a chain of biarcs.
+
+    The circle lies in the plane of least squares (SVD), where one arc explains the points; else a
+    chain of biarcs through points and tangents, which is still arcs, but as many as an S-shape
+    needs.
     """
     centre = points.mean(axis=0)
     _, size, axes = np.linalg.svd(points - centre, full_matrices=False)
@@ -184,8 +190,9 @@ SPATIAL: dict[str, Fit] = {
 
 def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
     """
-    (3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20; None when
-    straight.
+    (3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20.
+
+    None when straight.
 
     About the points' mean, eq. 20 falls apart into a 2x2 system for the centre and sigma =
     mean(x^2 + y^2).
@@ -212,7 +219,11 @@ def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
 
 
 def _arc_or_line(planar: np.ndarray, circle: np.ndarray | None, samples: int) -> np.ndarray:
-    """(samples, 2) along the Kasa circle from the first point's polar angle to the last's, eqs. 21-22."""
+    """
+    Walk (samples, 2) points along the Kasa circle, eqs. 21-22.
+
+    From the first point's polar angle to the last's.
+    """
     t = np.linspace(0.0, 1.0, samples)[:, None]
     if circle is None:
         return _line(planar, t)
@@ -231,8 +242,9 @@ def _line(planar: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 def _biarc_polygon(points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, ...]:
     """
-    Start, joint, end and the two inner control points of the biarc between neighbours, (N - 1, 3)
-    each.
+    Start, joint, end and the two inner control points of each biarc, (N - 1, 3) each.
+
+    A biarc joins two neighbours.
 
     Both arms have the length d for which the middle arm of the polygon is 2 d long.
     """
@@ -262,7 +274,7 @@ def _pieces(count: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
 def quadratic_chain(
     start: np.ndarray, control: np.ndarray, end: np.ndarray, samples: int
 ) -> np.ndarray:
-    """(samples, D) along quadratic Bezier pieces, eq. 13."""
+    """Chain (samples, D) points along quadratic Bezier pieces, eq. 13."""
     piece, u = _pieces(len(start), samples)
     u = u[:, None]
     return (1 - u) ** 2 * start[piece] + 2 * (1 - u) * u * control[piece] + u**2 * end[piece]
@@ -299,7 +311,7 @@ def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _cross3(a, b):
-    """A x b; NumPy's own takes seconds to compile."""
+    """Compute a x b; NumPy's own takes seconds to compile."""
     return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
@@ -307,7 +319,11 @@ def _cross3(a, b):
 
 @njit(cache=True)
 def extended(points: np.ndarray, length: float) -> np.ndarray:
-    """The curve carried on to `length` [m] with the curvature of its last tenth, or as it is when that long already."""
+    """
+    Carry the curve on to `length` [m] with the curvature of its last tenth.
+
+    It stays as it is when that long already.
+    """
     s = arclength(points)
     missing = length - s[-1]
     if missing <= 1e-9:

@@ -91,7 +91,7 @@ class ShapeSettings(Settings):
 
 
 def load_shape_settings(path: str | Path | None = None) -> ShapeSettings:
-    """Settings from a YAML file, or the defaults."""
+    """Load settings from a YAML file, or the defaults."""
     return ShapeSettings() if path is None else load_settings(ShapeSettings, path)
 
 
@@ -163,9 +163,10 @@ class _Module:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Snapshot:
     """
-    All modules at one stamp: which are good (M,), R_base_module (M, 3, 3), total fields (M, 3) and
-    the Earth's (3,) in the base frame [T], and covariances of the rotations in base axes (M, 3, 3)
-    [rad^2].
+    All modules at one stamp.
+
+    Which are good (M,), R_base_module (M, 3, 3), total fields (M, 3) and the Earth's (3,) in the
+    base frame [T], and covariances of the rotations in base axes (M, 3, 3) [rad^2].
     """
 
     stamp: int
@@ -351,7 +352,11 @@ class ShapeEstimator:
         module.filter.update(sample.stamp, sample.angular_velocity, accel)
 
     def _resume(self, module: _Module, m: int, stamp: int, accel: np.ndarray) -> None:
-        """An IMU that comes back starts at the backbone's rotation there, which the others have kept."""
+        """
+        Let an IMU that comes back start at the backbone's rotation there.
+
+        The others have kept it.
+        """
         module.lost = False
         R_map_imu = level(
             self.T_map_base[:3, :3] @ self._prior[m, :3, :3] @ self._R_module_imu[m], accel
@@ -455,7 +460,7 @@ class ShapeEstimator:
     def _joint(
         self, now: _Snapshot, order: tuple[int, ...] | None = None, sign: float = 1.0
     ) -> BackboneFit:
-        """The joint fit; `order` and `sign` try another wiring or a reversed magnet."""
+        """Fit all modules jointly; `order` and `sign` try another wiring or a reversed magnet."""
         order = list(range(len(now.good)) if order is None else order)
         R, good = now.R_base_module, now.good
         in_module = np.einsum('mji,mj->mi', R, now.field_base)
@@ -512,7 +517,11 @@ class ShapeEstimator:
             )
 
     def _suspects(self, now: _Snapshot, joint: BackboneFit) -> dict[str, str]:
-        """A joint fit this bad has a reason: try every order of the modules, and the magnet upside down."""
+        """
+        Find the reason of a joint fit this bad.
+
+        Try every order of the modules, and the magnet upside down.
+        """
         names = self.module_names
         trials = {
             (order, sign): self._joint(now, order, sign).consistency

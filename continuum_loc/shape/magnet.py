@@ -31,19 +31,25 @@ def magnet_volume(magnet: Magnet) -> float:
 
 
 def dipole_moment(magnet: Magnet) -> float:
-    """Signed moment along the axis [A m^2]: remanence * volume / mu_0 (M_c of the paper's eq. 1)."""
+    """
+    Signed moment along the axis [A m^2].
+
+    remanence * volume / mu_0 (M_c of the paper's eq. 1).
+    """
     return magnet.remanence * magnet_volume(magnet) / MU_0
 
 
 def with_moment(magnet: Magnet, moment: float) -> Magnet:
-    """The same magnet with its remanence set so that its moment is `moment` [A m^2]."""
+    """Set the magnet's remanence so that its moment is `moment` [A m^2]."""
     return magnet.model_copy(update={'remanence': moment * MU_0 / magnet_volume(magnet)})
 
 
 def magnet_parameters(magnet: Magnet, model: FieldModel = 'ring') -> np.ndarray:
     """
-    (5,) what the compiled kernels need: mu_0 M / 4 pi, then remanence / pi, half length, inner and
-    outer radius. The half length is 0 for the dipole model.
+    (5,) what the compiled kernels need.
+
+    mu_0 M / 4 pi, then remanence / pi, half length, inner and outer radius. The half length is 0
+    for the dipole model.
     """
     if model not in ('ring', 'dipole'):
         raise ValueError(f"field model '{model}' does not exist; valid: ring, dipole")
@@ -69,14 +75,22 @@ def ring_field(magnet: Magnet, p: np.ndarray) -> np.ndarray:
 
 
 def dipole_field(magnet: Magnet, p: np.ndarray) -> np.ndarray:
-    """(..., 3) field [T] of the point dipole of equal moment at `p` (..., 3) [m], magnet frame (paper eq. 2)."""
+    """
+    (..., 3) field [T] of the point dipole of equal moment at `p` (..., 3) [m].
+
+    In the magnet's frame (paper eq. 2).
+    """
     return field_and_gradient(magnet, p, 'dipole')[0]
 
 
 def field_and_gradient(
     magnet: Magnet, p: np.ndarray, model: FieldModel = 'ring'
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Field (..., 3) [T] and its gradient dB_i/dp_j (..., 3, 3) [T/m] at `p` (..., 3) [m], magnet frame."""
+    """
+    Field (..., 3) [T] and its gradient dB_i/dp_j (..., 3, 3) [T/m] at `p` (..., 3) [m].
+
+    In the magnet's frame.
+    """
     p = np.asarray(p, dtype=float)
     if p.shape[-1:] != (3,):
         raise ValueError(f'positions must have shape (..., 3), got {p.shape}')
@@ -88,8 +102,9 @@ def field_and_gradient(
 
 def invert_dipole(magnet: Magnet, field: np.ndarray) -> np.ndarray:
     """
-    (..., 3) the one position with x >= 0 whose dipole field is `field` (..., 3) [T]; -p has the
-    same field.
+    (..., 3) the one position with x >= 0 whose dipole field is `field` (..., 3) [T].
+
+    -p has the same field.
 
     In the plane of axis and field, tan(beta) = 3 tan(theta) / (2 - tan^2(theta)) for the field's
     angle beta and the position's angle theta off the axis: a quadratic with one root in 0..90
@@ -133,7 +148,11 @@ def _field_batch(parameters, points):
 
 @njit(cache=True)
 def evaluate_field(parameters, p, field, gradient):
-    """Field and gradient at one point, written into `field` (3,) and `gradient` (3, 3); magnet frame."""
+    """
+    Field and gradient at one point, in the magnet's frame.
+
+    Written into `field` (3,) and `gradient` (3, 3).
+    """
     if parameters[2] == 0.0:
         _dipole(parameters[0], p, field, gradient)
     else:
@@ -185,7 +204,11 @@ def _ring(strength, half_length, inner, outer, p, field, gradient):
 
 @njit(cache=True)
 def _sheet(a, half_length, rho, x):
-    """B_rho, B_x, dB_rho/dx and dB_x/dx of a unit current sheet (remanence / pi = 1) of radius a."""
+    """
+    B_rho, B_x, dB_rho/dx and dB_x/dx of a unit current sheet of radius a.
+
+    Unit: remanence / pi = 1.
+    """
     gamma = (a - rho) / (a + rho)
     if gamma == 0.0:
         gamma = 1e-15  # the integral's limit at rho = a
@@ -206,8 +229,10 @@ def _sheet(a, half_length, rho, x):
 @njit(cache=True)
 def _cel(kc, p, c, s):
     """
-    Bulirsch's complete elliptic integral of (c cos^2 + s sin^2) / ((cos^2 + p sin^2) sqrt(cos^2 +
-    kc^2 sin^2)) over 0..pi/2, for p > 0 and kc > 0.
+    Bulirsch's complete elliptic integral.
+
+    Of (c cos^2 + s sin^2) / ((cos^2 + p sin^2) sqrt(cos^2 + kc^2 sin^2)) over 0..pi/2, for p > 0
+    and kc > 0.
     """
     k = kc
     p = math.sqrt(p)

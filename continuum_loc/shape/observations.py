@@ -1,6 +1,7 @@
 """
-Field and gravity as vector observations of a body's pose: what a filter needs to use a Hall sensor
-or an accelerometer as a factor.
+Field and gravity as vector observations of a body's pose.
+
+They are what a filter needs to use a Hall sensor or an accelerometer as a factor.
 
 Both predict a known vector of the map in the body's frame, h = R^T w. For the right perturbation
 T <- T Exp([rho; phi]) its derivative is [R^T (dw/dp) R, [h]x].
@@ -24,8 +25,9 @@ def field_residual_and_jacobian(
     model: FieldModel = 'ring',
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Residual (..., 3) = R^T (B(p) + earth) - measured [T], and its Jacobian (..., 3, 6) by a right
-    perturbation [rho; phi] of T_map_body (..., 4, 4).
+    Residual (..., 3) = R^T (B(p) + earth) - measured [T], and its Jacobian (..., 3, 6).
+
+    By a right perturbation [rho; phi] of T_map_body (..., 4, 4).
 
     T_map_magnet: (4, 4) pose of the magnet's centre, its axis along x. measured: (..., 3) field
     [T] in the body's frame. earth_field: (3,) in map [T]. A saturated axis is nan in `measured`
@@ -42,8 +44,9 @@ def gravity_residual_and_jacobian(
     T_map_body: np.ndarray, measured: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Residual (..., 3) = R^T g - measured [m/s^2] of a resting accelerometer, and its Jacobian (...,
-    3, 6).
+    Residual (..., 3) = R^T g - measured [m/s^2], and its Jacobian (..., 3, 6).
+
+    Of a resting accelerometer.
 
     It holds while the body does not accelerate: gate it, or weight it by how far |measured|
     departs from g.

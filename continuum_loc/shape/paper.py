@@ -36,9 +36,10 @@ MENDS = {
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
     """
-    What the paper clears before the experiment, in the sensors' frames: gyro and accelerometer of
-    the straight, upright robot at rest, and the Hall sensors' readings without the magnet, (M, 3)
-    each.
+    What the paper clears before the experiment, (M, 3) each in the sensors' frames.
+
+    Gyro and accelerometer of the straight, upright robot at rest, and the Hall sensors' readings
+    without the magnet.
     """
 
     gyro: np.ndarray
@@ -47,20 +48,32 @@ class Background:
 
     @classmethod
     def of(cls, rest: Rest, rest_without_magnet: Rest) -> Background:
-        """From a rest with the magnet and one without it; what the IMU should read is +g along its z."""
+        """
+        From a rest with the magnet and one without it.
+
+        What the IMU should read is +g along its z.
+        """
         return cls(rest.gyro, rest.accel - [0.0, 0.0, GRAVITY], rest_without_magnet.field)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperEstimate:
-    """Points (M + 1, 3) [m] and tangents (M + 1, 3) of magnet and modules in the base frame, at the last sample."""
+    """
+    Points (M + 1, 3) [m] and tangents (M + 1, 3) of magnet and modules, at the last sample.
+
+    In the base frame.
+    """
 
     points: np.ndarray
     tangents: np.ndarray
     mends: frozenset[str]
 
     def curve(self, method: curves.CurveMethod, samples: int = 61) -> np.ndarray:
-        """(samples, 3) the projected curve; the quadratic one with the printed sign of kappa unless mended."""
+        """
+        Draw (samples, 3) points of the projected curve.
+
+        The quadratic one has the printed sign of kappa unless mended.
+        """
         if method == 'quadratic_bezier' and 'kappa' not in self.mends:
             return printed_quadratic_bezier(self.points, self.tangents, samples)
         return curves.fit_curve(
@@ -107,7 +120,11 @@ def _last_readings(
     background: Background,
     mends: frozenset[str],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """R_world_imu (M, 3, 3) by the paper's filter after all samples, and the last fields (M, 3)."""
+    """
+    R_world_imu (M, 3, 3) by the paper's filter after all samples, and the last fields.
+
+    Fields are (M, 3).
+    """
     filters = [
         EulerFilter(
             swap_as_printed='swap' not in mends,
@@ -135,7 +152,11 @@ def _last_readings(
 
 
 def printed_quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """Eqs. 12-14 and 23-24 with kappa exactly as printed; not finite where neighbouring tangents are parallel."""
+    """
+    Eqs. 12-14 and 23-24 with kappa exactly as printed.
+
+    Not finite where neighbouring tangents are parallel.
+    """
     p, n = curves.project(points), curves.project(tangents)
     chord = np.diff(p, axis=0)
     with np.errstate(divide='ignore', invalid='ignore'):

@@ -1,6 +1,7 @@
 """
-Where a module is, from the field it measures: the paper's bounded least squares (eq. 10),
-compiled.
+Where a module is, from the field it measures.
+
+The paper's bounded least squares (eq. 10), compiled.
 
     min |b - B(p)|^2   subject to   lower <= p <= upper,
 
@@ -110,8 +111,9 @@ class PositionSolver:
         attitude: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        (M, 6, 6) covariance of position and attitude errors in the magnet's frame, and
-        observability (M,).
+        (M, 6, 6) covariance of position and attitude errors, and observability (M,).
+
+        In the magnet's frame.
 
         sigma: white noise of the field [T]; attitude (M, 3, 3): covariance of the module's
         rotation error phi in the magnet's frame [rad^2], which turns the measured field: db = phi
@@ -153,7 +155,11 @@ def _covariance(parameters, position, field, variance, attitude, prior_sigma):
 
 @njit(cache=True)
 def _solve_all(parameters, fields, prior, lower, upper):
-    """From the prior first; where that is no exact fit, also from the dipole's closed form and its mirror image."""
+    """
+    From the prior first.
+
+    Where that is no exact fit, also from the dipole's closed form and its mirror image.
+    """
     modules = fields.shape[0]
     position = np.empty((modules, 3))
     residual = np.empty(modules)
@@ -240,7 +246,11 @@ def _relative_cost(field, measured, size):
 
 @njit(cache=True)
 def _step(field, gradient, measured, size, p, lower, upper, damping):
-    """Damped Gauss-Newton step over the axes that are free to move, and how much cost it could remove."""
+    """
+    Damped Gauss-Newton step over the axes that are free to move.
+
+    And how much cost it could remove.
+    """
     slope = np.zeros(3)
     H = np.zeros((3, 3))
     for i in range(3):

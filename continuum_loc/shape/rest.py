@@ -18,12 +18,20 @@ GATE = 6.0  # standard deviations; with 9 channels of 3 modules a false alarm in
 
 
 class MotionError(ValueError):
-    """The robot moved while it had to be at rest; the message names the sensors and by how much."""
+    """
+    The robot moved while it had to be at rest.
+
+    The message names the sensors and by how much.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rest:
-    """Mean readings of M modules at rest, each in its sensor's frame: gyro, accel, field (M, 3)."""
+    """
+    Mean readings of M modules at rest: gyro, accel, field (M, 3).
+
+    Each in its sensor's frame.
+    """
 
     gyro: np.ndarray
     accel: np.ndarray
@@ -64,7 +72,7 @@ class RestWindow:
 
     @property
     def fewest(self) -> int:
-        """Samples of the sensor that sent fewest."""
+        """Count the samples of the sensor that sent fewest."""
         return min(len(rows) for rows in self._rows.values())
 
     def silent(self) -> tuple[str, ...]:
@@ -73,7 +81,7 @@ class RestWindow:
 
     def finish(self) -> Rest:
         """
-        The means.
+        Take the means.
 
         Raises MotionError naming every sensor that moved, and ValueError for one that was silent.
 
@@ -95,7 +103,7 @@ class RestWindow:
         return Rest(**means, samples=self.fewest)
 
     def _motion(self, kind: str, name: str, rows: np.ndarray) -> str:
-        """What moved in one sensor's readings (N, 3), or an empty text."""
+        """Tell what moved in one sensor's readings (N, 3), or an empty text."""
         imu, hall = self.robot.imu_model, self.robot.hall_model
         noise, unit, scale = {
             'gyro': (imu.gyro_sigma, 'rad/s', 1.0),

@@ -69,7 +69,11 @@ PERFECT = Imperfections(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posture:
-    """Rotation of the base in map (3, 3), and twist and curvatures (N, 3) [1/m] of the N arcs from base to tip."""
+    """
+    Rotation of the base in map (3, 3), and twist and curvatures (N, 3) [1/m].
+
+    Those of the N arcs from base to tip.
+    """
 
     R_map_base: np.ndarray
     strain: np.ndarray
@@ -96,7 +100,11 @@ class Motion:
         return self.arrivals + np.asarray(self.hold)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """R_map_base (K, 3, 3) and strain (K, N, 3) at times (K,); acceleration is continuous throughout."""
+        """
+        R_map_base (K, 3, 3) and strain (K, N, 3) at times (K,).
+
+        Acceleration is continuous throughout.
+        """
         arrivals, departures = self.arrivals, self.departures
         knots = np.sort(np.concatenate([arrivals, departures]))
         index = np.clip(np.searchsorted(knots, times, side='right') - 1, 0, len(knots) - 2)
@@ -115,7 +123,11 @@ class Motion:
 
 
 def bent(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.ndarray:
-    """(N, 3) strain of one arc: the robot bends by `curvature` [1/m] from x towards y turned by `azimuth`."""
+    """
+    (N, 3) strain of one arc.
+
+    The robot bends by `curvature` [1/m] from x towards y turned by `azimuth`.
+    """
     return profile(robot, lambda s: (np.full_like(s, curvature), np.full_like(s, azimuth)))
 
 
@@ -123,8 +135,10 @@ def s_shape(
     robot: RobotDescription, curvature: float, azimuth: float = 0.0, halves: float = 1.0
 ) -> np.ndarray:
     """
-    (N, 3) strain of an S, whose curvature passes smoothly from `curvature` [1/m] at the base to
-    its opposite `halves` times; from 2 on its tangent turns across the magnet's axis.
+    (N, 3) strain of an S.
+
+    Its curvature passes smoothly from `curvature` [1/m] at the base to its opposite `halves`
+    times; from 2 on its tangent turns across the magnet's axis.
     """
     return profile(
         robot,
@@ -136,14 +150,22 @@ def s_shape(
 
 
 def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi / 2) -> np.ndarray:
-    """(N, 3) strain of `curvature` [1/m] whose bending plane turns by `turn` [rad] from base to tip."""
+    """
+    (N, 3) strain of `curvature` [1/m] whose bending plane turns from base to tip.
+
+    By `turn` [rad].
+    """
     return profile(robot, lambda s: (np.full_like(s, curvature), turn * s / robot.length))
 
 
 def profile(
     robot: RobotDescription, bend: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """(N, 3) strain of a twist-free shape: `bend` gives curvature [1/m] and azimuth [rad] at arclengths (N,)."""
+    """
+    (N, 3) strain of a twist-free shape.
+
+    `bend` gives curvature [1/m] and azimuth [rad] at arclengths (N,).
+    """
     ends = piece_ends(robot)
     curvature, azimuth = bend(ends - 0.5 * np.diff(ends, prepend=0.0))
     return np.column_stack(
@@ -152,7 +174,11 @@ def profile(
 
 
 def piece_ends(robot: RobotDescription) -> np.ndarray:
-    """(N,) arclengths [m] of the ends of the arcs: every `PIECES`-th is a module's, the last is the tip's."""
+    """
+    (N,) arclengths [m] of the ends of the arcs.
+
+    Every `PIECES`-th is a module's, the last is the tip's.
+    """
     marks = np.array(
         [0.0, *(robot.sensor_arclength(sensor.name) for sensor in robot.hall), robot.length]
     )
@@ -190,7 +216,7 @@ class Arm:
     def posture(
         self, strain: np.ndarray | None = None, R_base: np.ndarray | None = None
     ) -> Posture:
-        """A posture with the base turned by `R_base` (3, 3) in map against the robot description's."""
+        """Make a posture with the base turned by `R_base` (3, 3) in map from the description's."""
         turn = np.eye(3) if R_base is None else R_base
         return Posture(
             turn @ self.robot.base.T_map_base[:3, :3],
@@ -282,8 +308,10 @@ class Arm:
 
     def calibration_rests(self, seconds: float = 2.0) -> list[PosedRest]:
         """
-        Rests of the straight arm, the base turned through `CALIBRATION_TURNS` by an arm that is
-        off by `base_pose_deg`; the poses told are the commanded ones.
+        Rests of the straight arm, the base turned through `CALIBRATION_TURNS`.
+
+        It is turned by an arm that is off by `base_pose_deg`; the poses told are the commanded
+        ones.
         """
         rests = []
         for turn in CALIBRATION_TURNS:
