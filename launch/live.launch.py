@@ -40,7 +40,7 @@ ARGUMENTS = (
 
 
 def generate_launch_description():
-    """Simulator, estimator, recorder (with `bag`), RViz (with `rviz:=true`)."""
+    """Launch simulator, estimator, recorder (with `bag`), RViz (with `rviz:=true`)."""
     arg = LaunchConfiguration
     text = {
         name: ParameterValue(arg(name), value_type=str)

@@ -1,6 +1,7 @@
 """
-Hypothesis draws the same examples in every run, so that a change and not chance breaks a test; to
-search anew: HYPOTHESIS_PROFILE=explore make test.
+Hypothesis draws the same examples in every run, so that no chance breaks a test.
+
+Only a change does. To search anew: HYPOTHESIS_PROFILE=explore make test.
 """
 
 import os

@@ -1,4 +1,8 @@
-"""What the node tests share: nodes as processes on a graph of their own, and a client that talks to them."""
+"""
+What the node tests share.
+
+Nodes as processes on a graph of their own, and a client that talks to them.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +61,7 @@ MATCHED = (
 
 
 def fresh_domain() -> int:
-    """A ROS_DOMAIN_ID that no other test of this run has."""
+    """Take a ROS_DOMAIN_ID that no other test of this run has."""
     return 1 + next(_numbers) % 100
 
 
@@ -151,7 +155,7 @@ class Client:
         return wait_until(condition, patience, self.spin)
 
     def hear(self, topic: str, qos=None) -> list:
-        """The decoded items that come on a topic of the contract, as they come."""
+        """Yield the decoded items that come on a topic of the contract, as they come."""
         spec = topic_spec(topic)
         items = self.heard.setdefault(topic, [])
         self.node.create_subscription(
@@ -180,8 +184,9 @@ class Client:
 
     def await_speakers(self) -> None:
         """
-        Wait until somebody publishes on every topic that this client hears, and knows that it
-        does: what is said before that is lost.
+        Wait until somebody publishes on every topic that this client hears, and knows it.
+
+        What is said before that is lost.
         """
         assert self.until(
             lambda: all(self.node.count_publishers(topic) > 0 for topic in self.heard)
@@ -200,7 +205,11 @@ class Client:
 
 
 class BoxRobot:
-    """Samples of a straight, resting robot in a box, whose distances are known, and so the right estimate."""
+    """
+    Samples of a straight, resting robot in a box.
+
+    The distances are known, and so the right estimate.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.path, self.map = folder / 'stub.yaml', folder / 'box.csv'
@@ -229,7 +238,7 @@ class BoxRobot:
         yield 'joint_states', EncoderSample(stamp, ('insertion',), np.zeros(1), np.zeros(1))
 
     def frame(self, sensor, stamp: int) -> TofFrame:
-        """The distances to the box, to half a millimetre."""
+        """Measure the distances to the box, to half a millimetre."""
         ring = 1 + self.robot.ring_names.index(sensor.ring)
         T = self.T_map_ring[ring] @ sensor.mount.T_ring_sensor
         rays = self.robot.tof_model.directions

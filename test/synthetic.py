@@ -1,4 +1,8 @@
-"""A body that bends and is inserted along a known path, samples of it, and an estimator with known errors."""
+"""
+A body that bends and is inserted along a known path.
+
+Samples of it, and an estimator with known errors.
+"""
 
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Estimate
@@ -36,7 +40,7 @@ def samples(robot: RobotDescription, duration: float, seed: int = 0):
 
 
 def frame(robot: RobotDescription, name: str, stamp: int, rng: np.random.Generator) -> TofFrame:
-    """A frame of random ranges, one zone in ten without return."""
+    """Draw a frame of random ranges, one zone in ten without return."""
     ranges = rng.uniform(0.2, 0.6, len(robot.tof_model.directions))
     status = np.where(rng.random(len(ranges)) < 0.1, 255, TOF_VALID).astype(np.uint8)
     return TofFrame(
@@ -50,7 +54,11 @@ def frame(robot: RobotDescription, name: str, stamp: int, rng: np.random.Generat
 
 
 class NoisyFilter:
-    """Answers each cycle of ToF frames with the true poses plus errors of exactly the covariance it states."""
+    """
+    Answers each cycle of ToF frames with the true poses plus errors.
+
+    Errors have exactly the covariance it states.
+    """
 
     def __init__(
         self, robot: RobotDescription | None = None, sigma: float = 0.002, seed: int = 0

@@ -1,4 +1,8 @@
-"""Bags: everything of the contract is written and read back; damaged and foreign bags are named."""
+"""
+Bags: everything of the contract is written and read back.
+
+Damaged and foreign bags are named.
+"""
 
 import re
 

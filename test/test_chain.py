@@ -1,4 +1,8 @@
-"""The chain against dense algebra: solution, covariances, and marginalisation equal to the batch."""
+"""
+Test the chain against dense algebra.
+
+Solution, covariances, and marginalisation equal to the batch.
+"""
 
 from continuum_loc.estimator.chain import Blocks, Chain, Message, SingularError
 import numpy as np
@@ -49,7 +53,11 @@ def test_solution_and_covariances_equal_dense_algebra(seed):
 
 
 def test_marginalising_equals_the_batch_solution():
-    """Sliding a window of three columns over a linear problem ends where the batch over all columns does."""
+    """
+    Sliding a window of three columns over a linear problem ends where the batch does.
+
+    The batch is over all columns.
+    """
     start, intervals = random_chain(7)
     H, g = dense(start, intervals)
     batch = np.linalg.solve(H, -g)

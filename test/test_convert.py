@@ -1,4 +1,8 @@
-"""Messages and measurements: what goes in comes out, in both flavours of messages, and bad input is named."""
+"""
+Messages and measurements: what goes in comes out.
+
+In both flavours of messages, and bad input is named.
+"""
 
 from dataclasses import fields
 from types import SimpleNamespace
@@ -178,7 +182,11 @@ def test_a_tracked_pose_survives_and_its_topic_names_the_sensor(make, pose):
 @given(data=st.data())
 @settings(max_examples=5, deadline=None)
 def test_both_flavours_serialise_to_the_same_content(topic, data):
-    """CDR of rclpy, read by rosbags, gives the same measurement: so bags and graphs interoperate."""
+    """
+    CDR of rclpy, read by rosbags, gives the same measurement.
+
+    So bags and graphs interoperate.
+    """
     from rclpy.serialization import serialize_message
 
     item = data.draw(MEASUREMENTS[topic])
@@ -188,7 +196,11 @@ def test_both_flavours_serialise_to_the_same_content(topic, data):
 
 
 def test_the_pose_covariance_is_turned_into_the_axes_of_the_map():
-    """Samples of T Exp(delta) scatter in map axes with the published covariance: positions and rotation vectors."""
+    """
+    Samples of T Exp(delta) scatter in map axes with the published covariance.
+
+    Positions and rotation vectors.
+    """
     rng = np.random.default_rng(3)
     T = lie.exp(np.array([0.3, -0.2, 0.5, 0.8, -1.1, 0.4]))
     A = rng.normal(size=(6, 6))

@@ -16,7 +16,11 @@ VL53L5CX = TofModel(convention='perpendicular', flip_rows=True, flip_columns=Tru
 @given(distance=st.integers(100, 4000))
 @settings(max_examples=20, deadline=None)
 def test_a_wall_across_the_axis_is_flat(distance):
-    """Perpendicular distances of one value are a plane: every point has that x, and the ranges grow to the corners."""
+    """
+    Perpendicular distances of one value are a plane.
+
+    Every point has that x, and the ranges grow to the corners.
+    """
     frame = vl53l5cx_frame(VL53L5CX, 'a', 1, [distance] * 64, [5] * 64)
     np.testing.assert_allclose(frame.points[:, 0], distance / 1000)
     np.testing.assert_allclose(frame.ranges, np.linalg.norm(frame.points, axis=1))
@@ -28,7 +32,11 @@ def test_a_wall_across_the_axis_is_flat(distance):
 
 
 def test_the_lens_is_undone():
-    """The first zone of the mounted sensor looks to +y, +z of a frame whose rows and columns would begin at -y, -z."""
+    """
+    The first zone of the mounted sensor looks to +y, +z.
+
+    The rows and columns of the frame would begin at -y, -z.
+    """
     assert (vl53l5cx_frame(VL53L5CX, 'a', 1, [1000] * 64, [5] * 64).points[0, 1:] > 0).all()
     plain = TofModel(convention='perpendicular')
     assert (vl53l5cx_frame(plain, 'a', 1, [1000] * 64, [5] * 64).points[0, 1:] < 0).all()
@@ -63,7 +71,11 @@ def test_ism330_at_its_data_sheet_sensitivities():
 @given(theta=st.floats(-3.1, 3.1), kappa=st.floats(0.05, 20.0), common=st.floats(-1e-3, 1e-3))
 @settings(max_examples=50, deadline=None)
 def test_bending_is_found_whatever_temperature_and_tension(theta, kappa, common):
-    """The curvature vector points to the inside of the bend: a core there is shortened by kappa times its distance."""
+    """
+    The curvature vector points to the inside of the bend.
+
+    A core there is shortened by kappa times its distance.
+    """
     azimuth, radius = np.array([10.0, 130.0, 250.0]), 35e-6
     strain = common - kappa * radius * np.cos(np.radians(azimuth) - theta)
     sample = fbg_sample(1, [0.1], [strain], azimuth, radius)
@@ -72,7 +84,11 @@ def test_bending_is_found_whatever_temperature_and_tension(theta, kappa, common)
 
 
 def test_the_bending_plane_is_that_of_the_measurement():
-    """Bent with theta = 0 the backbone curves towards +y: strain (0, -sin theta, cos theta) kappa, a turn about +z."""
+    """
+    Bent with theta = 0 the backbone curves towards +y.
+
+    Strain (0, -sin theta, cos theta) kappa, a turn about +z.
+    """
     from continuum_loc import lie
 
     sample = fbg_sample(1, [0.0], [[-1e-3, 0.5e-3, 0.5e-3]], [0.0, 120.0, 240.0], 1e-3)

@@ -1,4 +1,8 @@
-"""Every factor's gradient and Hessian against finite differences of its own residuals, over random states."""
+"""
+Every factor's gradient and Hessian against finite differences of its own residuals.
+
+Over random states.
+"""
 
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings
@@ -168,7 +172,7 @@ def test_prior_gradient(seed):
 
 
 def test_strain_matches_the_papers_map():
-    """Eqs. 7-8: Ad(Rx(theta)) [1 0 0 0 0 kappa] has the bending that the factor takes as measured."""
+    """Eqs. 7-8: Ad(Rx(theta)) [1 0 0 0 0 kappa] has the bending that the factor measures."""
     description = robot()
     factor = make_factor('strain', description, Grid(description, 0.16))
     theta, kappa = np.array([0.3, -2.0]), np.array([0.8, 1.5])
@@ -182,7 +186,11 @@ def test_strain_matches_the_papers_map():
 
 
 def test_strain_noise_across_the_bending_plane():
-    """Across the plane the noise is kappa sigma_theta where that is larger, along it sigma_kappa."""
+    """
+    Across the plane the noise is kappa sigma_theta where that is larger.
+
+    Along it, it is sigma_kappa.
+    """
     description = robot()
     factor = make_factor('strain', description, Grid(description, 0.16))
     kappa = 4.0

@@ -1,4 +1,8 @@
-"""The filter's studies judge as they say: times off, recovery, culprits, honesty; faults do what they are called."""
+"""
+The filter's studies judge as they say, and faults do what they are called.
+
+Times off, recovery, culprits, honesty.
+"""
 
 from dataclasses import replace
 import json
@@ -37,7 +41,7 @@ flags = st.lists(st.booleans(), min_size=1, max_size=40).map(np.array)
 
 
 def made_up(error, status, accused=None, shares=None, case=None) -> CaseResult:
-    """A case of steps at 10 Hz whose rings are off by `error` (K, R) [m]."""
+    """Make a case of steps at 10 Hz whose rings are off by `error` (K, R) [m]."""
     error = np.asarray(error, float)
     count, rings = error.shape
     times = 0.1 * np.arange(count)
@@ -184,7 +188,11 @@ def test_no_study_rests_on_the_hold_out_and_no_two_cases_share_a_folder(quick):
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Synthetic recordings and a filter of known errors in place of the simulator's; how many filters were made."""
+    """
+    Synthetic recordings and a filter of known errors in place of the simulator's.
+
+    Tells how many filters were made.
+    """
     made = []
 
     def filter_(robot, prior_map, settings):
@@ -251,7 +259,7 @@ EVERYONE = {'ring4_tof2': 0.95, 'tip_tof': 0.9, 'ring1_imu': 1.0}
 
 
 def fault_case(error, clean_accused=None, **diagnosis) -> dict:
-    """The row of a stuck `ring4_tof2` from 1 s to 3 s, beside a clean run that is off by 1 mm."""
+    """Judge a stuck `ring4_tof2` from 1 s to 3 s, beside a clean run that is off by 1 mm."""
     fault = Freeze(sensors=('ring4_tof2',), start=1.0, end=3.0)
     clean = made_up(
         np.full((60, 5), 0.001), 'tracking', accused=clean_accused, shares=[EVERYONE] * 60
@@ -289,7 +297,11 @@ def test_a_culprit_is_named_as_a_suspect_or_by_its_silence_and_only_in_time():
 
 
 def test_who_is_accused_without_the_fault_is_no_finding():
-    """Neither to the diagnosis' credit, where it is the culprit, nor charged to the fault, where it is another."""
+    """
+    Neither to the diagnosis' credit nor charged to the fault.
+
+    The former where it is the culprit, the latter where it is another.
+    """
     blamed = [['ring4_tof2', 'tip_tof']] * 60
     row = fault_case(
         np.full((60, 5), 0.001), clean_accused=blamed, accused=blamed, shares=[EVERYONE] * 60
@@ -338,7 +350,7 @@ def test_components_of_an_honest_filter_have_unit_spread():
 
 
 def test_the_speed_of_turning_is_the_truth_s():
-    """Against omega = dR/dt by finite differences ten times closer than the span that the study takes."""
+    """Against omega = dR/dt by finite differences, ten times closer than the study's span."""
     robot = load_robot('engine')
     truth = replay(samples(robot, 4.0), NoisyFilter(robot)).truth
     at = START + np.array([1, 2, 3]) * NANOSECONDS

@@ -1,4 +1,8 @@
-"""The Gaussian process: exact on constant rates, Jacobians by finite differences, the bridge by conditioning."""
+"""
+Gaussian process: exact on constant rates.
+
+Jacobians by finite differences, the bridge by conditioning.
+"""
 
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp

@@ -1,4 +1,8 @@
-"""Group axioms, the exponential against SciPy's expm, Jacobians against finite differences, near 0 and near pi."""
+"""
+Group axioms, the exponential against SciPy's expm, Jacobians against finite differences.
+
+Near 0 and near pi.
+"""
 
 from continuum_loc import lie, lie_kernels
 from hypothesis import given, settings

@@ -1,4 +1,8 @@
-"""The index is exact: against brute force and SciPy, for any cloud and query, whatever its cache holds."""
+"""
+Test that the index is exact, for any cloud and query, whatever its cache holds.
+
+Against brute force and SciPy.
+"""
 
 from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.voxel_index import PATIENCE, VoxelIndex
@@ -28,7 +32,11 @@ def brute_force(points, queries, max_distance, allowed=None):
 
 
 def clouds():
-    """Clouds that break indices: few points, coincident ones, lines, lattices with ties, far outliers."""
+    """
+    Clouds that break indices.
+
+    Few points, coincident ones, lines, lattices with ties, far outliers.
+    """
     coordinate = st.one_of(
         st.integers(-3, 3).map(float), st.floats(-1.0, 1.0), st.sampled_from([0.0, 1e-9, 50.0])
     )

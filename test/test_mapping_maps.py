@@ -1,4 +1,8 @@
-"""Maps: sampling is blue noise with exact normals, planarity is what the paper defines, files lose nothing."""
+"""
+Maps: sampling is blue noise with exact normals, and files lose nothing.
+
+Planarity is what the paper defines.
+"""
 
 from continuum_loc.mapping.build import DENSITY, local_shape, map_from_cloud, sample_mesh
 from continuum_loc.mapping.errors import MapError

@@ -1,4 +1,8 @@
-"""Reconstruction and anomalies: covariance against Monte Carlo, detection in rooms whose differences are known."""
+"""
+Reconstruction and anomalies.
+
+Covariance against Monte Carlo, detection in rooms whose differences are known.
+"""
 
 from continuum_loc import lie
 from continuum_loc.mapping.anomalies import (
@@ -47,7 +51,7 @@ COMMON = placed(trimesh.creation.box((0.1, 0.1, 0.2)), 0.1, -0.22, 0.1)
 
 
 def swaying(covariance=None):
-    """The arm hanging in the room, bending to and fro."""
+    """Bend the arm that hangs in the room to and fro."""
     poses = np.empty((FRAMES, 4, 4, 4))
     for k in range(FRAMES):
         poses[k, 0] = ROBOT.base.T_map_base
@@ -58,7 +62,7 @@ def swaying(covariance=None):
 
 
 def measured(trajectory, mesh, seed=0, noise=True):
-    """ToF frames of the paper's noise, cast into the mesh from the true poses."""
+    """Cast ToF frames of the paper's noise into the mesh from the true poses."""
     import open3d
 
     rng, zones = np.random.default_rng(seed), ROBOT.tof_model.directions
@@ -104,7 +108,11 @@ def test_without_noise_every_point_lies_on_the_mesh():
 
 
 def test_covariance_matches_monte_carlo():
-    """Draw poses and ranges as the covariances state them; the scatter of the points is eq. 11's (5 % of its norm)."""
+    """
+    Draw poses and ranges as the covariances state them.
+
+    The scatter of the points is eq. 11's (5 % of its norm).
+    """
     rng = np.random.default_rng(1)
     root = np.diag([0.004, 0.003, 0.005, 0.01, 0.02, 0.015]) @ (
         np.eye(6) + 0.3 * rng.normal(size=(6, 6))
@@ -133,7 +141,11 @@ def test_covariance_matches_monte_carlo():
 
 
 def test_points_are_consistent_with_their_covariance():
-    """Normalised distances to a plane have unit variance: the floor of the room, at 0.1 % false alarms."""
+    """
+    Normalised distances to a plane have unit variance.
+
+    The plane is the floor of the room, at 0.1 % false alarms.
+    """
     trajectory = swaying()
     cloud = reconstruct(ROBOT, measured(trajectory, room(), seed=2), trajectory, floor=1e-6)
     down = (cloud.origins - cloud.points)[:, 2] > 0.9 * np.linalg.norm(
@@ -237,7 +249,11 @@ def test_an_unchanged_room_has_no_anomalies():
 
 
 def test_points_on_the_map_pass_the_chi2_test_at_its_level():
-    """Eq. 12 with Sigma_nn of the sampling: points of the surface exceed the 1 % quantile of chi2(3) in at most 2 %."""
+    """
+    Eq. 12 with Sigma_nn of the sampling.
+
+    Points of the surface exceed the 1 % quantile of chi2(3) in at most 2 %.
+    """
     trajectory, mesh = swaying(), room()
     prior = sample_mesh(mesh.vertices, mesh.faces, spacing=0.01)
     cloud = reconstruct(ROBOT, measured(trajectory, mesh, seed=5), trajectory)
@@ -258,7 +274,11 @@ def test_witnesses_to_the_contrary_lower_the_confidence():
 
 
 def test_wilson_bound_covers_the_true_share_as_often_as_it_says():
-    """One-sided 95 %: the bound exceeds the truth in about 5 % of 4000 draws (false alarm of this test below 1e-6)."""
+    """
+    One-sided 95 %: the bound exceeds the truth in about 5 % of 4000 draws.
+
+    False alarm of this test is below 1e-6.
+    """
     draws = np.random.default_rng(7).binomial(40, 0.8, 4000)
     above = np.mean([wilson_lower_bound(k, 40, 1.645) > 0.8 for k in draws])
     assert above < 0.09

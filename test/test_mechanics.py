@@ -34,7 +34,7 @@ def settled_tip(links, force=(0, 0, 0), moment=(0, 0, 0), supported=True, **kwar
 
 
 def test_reference_solutions_agree_with_each_other():
-    """The shooting solution of the rod's equations reproduces the elliptic integrals of the elastica."""
+    """The shooting solution of the rod's equations gives the elastica's elliptic integrals."""
     T = cosserat_shape([LENGTH], LENGTH, EI, EI, tip_force=(0, 0, -0.2))[0]
     x, drop = elastica_tip(0.2, EI, LENGTH)
     np.testing.assert_allclose(T[:3, 3], [x, 0.0, -drop], atol=1e-7)
@@ -179,7 +179,11 @@ def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
 
 
 def test_tendon_friction_leaves_a_hysteresis():
-    """From below and from above, the same tension F bends as F - 2 f and F + 2 f: two tendons move, both rub."""
+    """
+    From below and from above, the same tension F bends as F - 2 f and F + 2 f.
+
+    Two tendons move, both rub.
+    """
     friction, pull = 0.5, 3.0
     plant, model = tendon_rod(friction=friction)
     data = mujoco.MjData(model)

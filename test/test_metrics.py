@@ -1,4 +1,8 @@
-"""Errors against evo's, consistency against the distributions it is defined by, tracks against their files."""
+"""
+Errors against evo's, consistency against the distributions it is defined by.
+
+And tracks against their files.
+"""
 
 from continuum_loc import lie
 from continuum_loc.evaluation.metrics import drift_band, Errors, errors, nees, summarise
@@ -14,7 +18,11 @@ START = 1_700_000_000 * NANOSECONDS + 123_456_789
 
 
 def smooth_truth(count: int = 200, period: float = 0.01) -> Track:
-    """A body whose rings turn and travel at constant body velocities, so that geodesics are exact."""
+    """
+    Move a body whose rings turn and travel at constant body velocities.
+
+    So geodesics are exact.
+    """
     twists = np.array(
         [[0, 0, 0, 0, 0, 0], [0.1, 0.02, 0, 0, 0.3, 0.1], [0.2, -0.1, 0.05, 0.2, 0.5, -0.7]], float
     )

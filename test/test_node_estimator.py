@@ -1,4 +1,8 @@
-"""Node `estimator` as a process, over real DDS: a robot at rest in a box whose distances are exact."""
+"""
+Node `estimator` as a process, over real DDS.
+
+A robot at rest in a box whose distances are exact.
+"""
 
 import json
 from pathlib import Path
@@ -66,7 +70,7 @@ def graph(box, tmp_path_factory):
 
 @pytest.fixture
 def fresh(graph):
-    """The graph with the estimate begun anew and nothing heard yet."""
+    """Return the graph with the estimate begun anew and nothing heard yet."""
     client, node, _ = graph
     assert client.call(Trigger, 'estimator/reset', Trigger.Request()).success
     for items in client.heard.values():
@@ -148,7 +152,11 @@ def test_services_save_what_was_estimated(fresh, box):
 
 
 def test_initialpose_moves_the_base(fresh, box):
-    """Given a base 3 cm to the side, known to the robot description's 0.5 mm, the estimate starts there."""
+    """
+    The estimate starts at the base that it is given, 3 cm to the side.
+
+    Known to the robot description's 0.5 mm.
+    """
     client, node, _ = fresh
     publisher = client.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
     assert client.until(lambda: publisher.get_subscription_count() > 0)

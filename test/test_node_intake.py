@@ -1,4 +1,8 @@
-"""Between messages and the estimator: the queue's order of sacrifice, rules for stamps, and 10,000 bad messages."""
+"""
+Between messages and the estimator.
+
+The queue's order of sacrifice, rules for stamps, and 10,000 bad messages.
+"""
 
 from collections import Counter
 from dataclasses import replace
@@ -34,7 +38,11 @@ START = 1000 * SECOND
 
 
 def test_topics_torn_apart_by_a_backlog_are_merged_again_by_stamp():
-    """Reception empties one topic after the other; what leaves is in the order of the stamps, unless one lies."""
+    """
+    Reception empties one topic after the other.
+
+    What leaves is in the order of the stamps, unless one lies.
+    """
     samples = [
         (_topic(sample), sample) for sample in rest_samples(load_robot('engine'), 1.0, START)
     ]
@@ -71,7 +79,11 @@ def test_messages_leave_in_the_order_of_arrival_across_topics():
 
 
 def test_an_overloaded_queue_gives_up_in_its_defined_order():
-    """Fill with equal numbers of everything; as capacity shrinks, kinds go one after the other, oldest first."""
+    """
+    Fill with equal numbers of everything.
+
+    As capacity shrinks, kinds go one after the other, oldest first.
+    """
     inbox = Inbox(IntakeSettings(queue_capacity=10_000, max_backlog=1e9))
     for number in range(100):
         for kind in SACRIFICE:
@@ -165,7 +177,7 @@ def test_lone_wild_stamps_never_move_the_clock():
 
 
 def _bad(rng, kind, topic, item):
-    """A message of `item` spoiled in one way, or raw bytes."""
+    """Spoil a message of `item` in one way, or make raw bytes of it."""
     make = bag_messages()
     spec = topic_spec(topic)
     if kind in ('zero stamp', 'future stamp', 'unknown frame'):
@@ -218,7 +230,8 @@ def _emptied(message, topic):
         message.name, message.position, message.effort = [], np.empty(0), np.empty(0)
 
 
-CLASSES = {  # class of spoiled messages -> topics, and what the intake calls it (None: a valid message of its kind)
+# Class of spoiled messages -> topics, and what the intake calls it (None: a valid message).
+CLASSES = {
     'zero stamp': (('tof/points', 'imu/data_raw', 'joint_states'), {'zero stamp'}),
     'future stamp': (('tof/points', 'imu/data_raw', 'joint_states'), {'future stamp'}),
     'unknown frame': (('tof/points', 'imu/data_raw'), {'unknown frame'}),
@@ -234,9 +247,10 @@ CLASSES = {  # class of spoiled messages -> topics, and what the intake calls it
 
 def test_ten_thousand_bad_messages_are_refused_by_class_and_leave_the_good_ones_unharmed():
     """
-    Every bad message is refused under its class, each class is reported once, and what gets
-    through is exactly
-    what gets through without any bad message: so the estimates are unharmed, whatever the filter.
+    Every bad message is refused under its class, each class is reported once.
+
+    What gets through is exactly what gets through without any bad message: so the estimates are
+    unharmed, whatever the filter.
     """
     rng = np.random.default_rng(7)
     robot = load_robot('engine')

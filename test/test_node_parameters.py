@@ -1,4 +1,8 @@
-"""Parameters: declared from the typed settings, described, with ranges; files checked; YAML of every node in step."""
+"""
+Parameters: declared from the typed settings, described, with ranges.
+
+Files are checked, and the YAML of every node is in step.
+"""
 
 import contextlib
 from pathlib import Path

@@ -1,4 +1,8 @@
-"""Simulator, recorder and replayer as processes: what is published is in the bag, and comes back from it."""
+"""
+Simulator, recorder and replayer as processes.
+
+What is published is in the bag, and comes back from it.
+"""
 
 from collections import Counter
 import json

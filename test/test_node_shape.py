@@ -1,4 +1,8 @@
-"""Node `shape` as a process: a straight Hall + IMU arm at rest, then bent, from the analytic simulation."""
+"""
+Node `shape` as a process.
+
+A straight Hall + IMU arm at rest, then bent, from the analytic simulation.
+"""
 
 import signal
 

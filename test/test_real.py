@@ -1,4 +1,8 @@
-"""The recorded trials: their import, and the filter on them (skipped where CONTINUUM_LOC_DATA is unset)."""
+"""
+Recorded trials: their import, and the filter on them.
+
+Skipped where CONTINUUM_LOC_DATA is unset.
+"""
 
 import os
 
@@ -37,7 +41,11 @@ def _write(path, kind, s, rows):
 
 @pytest.fixture
 def trial(tmp_path):
-    """A straight robot along the map's z that turns about it at 0.5 rad/s, in the files' own frames."""
+    """
+    Write a straight robot along the map's z that turns about it at 0.5 rad/s.
+
+    In the files' own frames.
+    """
     folder = tmp_path / 'trial'
     folder.mkdir()
     times = np.arange(-0.04, 1.0, 0.02)
@@ -62,7 +70,11 @@ def trial(tmp_path):
 
 
 def test_the_tangent_becomes_body_x_and_motion_keeps_its_meaning(trial):
-    """A rate in the imported body frame is what the imported poses turn by: dT/dt = T hat(omega), about the tangent."""
+    """
+    A rate in the imported body frame is what the imported poses turn by.
+
+    dT/dt = T hat(omega), about the tangent.
+    """
     recording = read_recording(trial, ROBOT)
     tip = [
         sample
@@ -150,7 +162,11 @@ def test_what_the_robot_does_not_have_is_named(trial, tmp_path):
 
 @needs_data
 def test_hermite_curves_give_the_published_figures():
-    """The metric is the published one: plain Hermite interpolation has the published RMSE, to its last digit."""
+    """
+    The metric is the published one.
+
+    Plain Hermite interpolation has the published RMSE, to its last digit.
+    """
     from continuum_loc.evaluation.studies.real import data_folder, HERMITE, hermite_errors, WINDOWS
 
     for name, window in WINDOWS.items():
@@ -161,7 +177,11 @@ def test_hermite_curves_give_the_published_figures():
 
 @needs_data
 def test_the_smoothed_filter_beats_hermite_and_the_published_filter_inside_the_body(tmp_path):
-    """At the three discs without a tracker, through the impulses, 0.1 s late; gyros and bending must help there."""
+    """
+    At the three discs without a tracker, through the impulses, 0.1 s late.
+
+    Gyros and bending must help there.
+    """
     from continuum_loc.evaluation.studies.real import run
 
     inner = [

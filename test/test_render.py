@@ -1,4 +1,8 @@
-"""The ray-cast pictures show what geometry says: a sphere's disc, its section, and the parts of a robot."""
+"""
+The ray-cast pictures show what geometry says.
+
+A sphere's disc, its section, and the parts of a robot.
+"""
 
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.render import (

@@ -1,4 +1,8 @@
-"""The report shows the figures of the run, needs no network, and loses no peak on the way to a picture."""
+"""
+The report shows the figures of the run and needs no network.
+
+It loses no peak on the way to a picture.
+"""
 
 from dataclasses import replace
 import re

@@ -1,4 +1,8 @@
-"""Scenes: closed, of the stated size, with free way for the robot, and with exact truth of their anomalies."""
+"""
+Scenes: closed, of the stated size, with free way for the robot.
+
+And with exact truth of their anomalies.
+"""
 
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator import convex, mesh_import, scene_cache
@@ -63,7 +67,11 @@ def test_engine_is_3_1_m_across_with_its_axis_along_x():
 
 
 def test_a_blade_row_looks_the_same_after_a_pitch_up_to_its_mistuning():
-    """The symmetry that misleads an estimate without strain: the next blade is within a few millimetres."""
+    """
+    The symmetry that misleads an estimate without strain.
+
+    The next blade is within a few millimetres.
+    """
     scene = load_scene('S0')
     caster = RayCaster(scene)
     of_rotor = np.array([name.startswith('rotor1') for name in scene.objects])[scene.face_object]

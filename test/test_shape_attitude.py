@@ -1,4 +1,8 @@
-"""Attitude from IMU samples: known tilts, gravity's silence on yaw, the gate, and what the printed form gets wrong."""
+"""
+Attitude from IMU samples.
+
+Known tilts, gravity's silence on yaw, the gate, and what the printed form gets wrong.
+"""
 
 from continuum_loc import lie
 from continuum_loc.measurements import nanoseconds
@@ -39,7 +43,11 @@ def yaw_between(R_a, R_b):
 @given(rotation_vectors)
 @settings(max_examples=12, deadline=None)
 def test_gravity_levels_and_never_yaws(vector):
-    """From a wrong tilt, corrections bring 'up' onto the measured up along the shortest way: no turn about z."""
+    """
+    From a wrong tilt, corrections bring 'up' onto the measured up.
+
+    Along the shortest way: no turn about z.
+    """
     true = lie.so3_exp(vector)
     wrong = true @ lie.so3_exp(np.array([0.2, -0.1, 0.15]))
     attitude = started(wrong)
@@ -66,7 +74,11 @@ def test_level_is_the_least_turn_onto_gravity(prior, vector):
 
 
 def test_gyro_alone_integrates_a_turn_to_second_order():
-    """A smooth turn of 129 degrees about one axis, past 90 degrees of pitch, with the gate shut."""
+    """
+    A smooth turn of 129 degrees about one axis, with the gate shut.
+
+    It goes past 90 degrees of pitch.
+    """
 
     def error(steps):
         attitude = started(np.eye(3), gate=1e-9)
@@ -93,7 +105,11 @@ def test_moving_acceleration_is_gated():
 
 
 def test_tilt_stays_and_yaw_drifts_by_the_residual_bias():
-    """A bias of b about the vertical gives yaw b t and its covariance says so; a level bias gives tilt b tau."""
+    """
+    A bias of b about the vertical gives yaw b t and its covariance says so.
+
+    A level bias gives tilt b tau.
+    """
     bias = 2e-3
     attitude = started(np.eye(3), time_constant=1.0, bias_sigma=bias)
     for k in range(1, 2001):

@@ -1,4 +1,8 @@
-"""Curves: exact on what they are made for, whole on S-shapes and in space, and straight without failing."""
+"""
+Curves: exact on what they are made for, whole on S-shapes and in space.
+
+And straight without failing.
+"""
 
 from continuum_loc import lie
 from continuum_loc.robot import load_robot
@@ -69,7 +73,11 @@ def test_straight_is_a_line(method, projected):
 
 
 def nearly_straight(noise):
-    """Points, tangents and truth of a straight robot with noise (15,) on its modules and their tangents."""
+    """
+    Points, tangents and truth of a straight robot with noise (15,).
+
+    On its modules and their tangents.
+    """
     points, tangents, truth = sampled(bent(ROBOT, 0.0))
     noise = np.array(noise)
     points = points + np.vstack([np.zeros(3), noise[:9].reshape(3, 3)])
@@ -85,7 +93,11 @@ NOISE = st.lists(st.floats(-1e-4, 1e-4), min_size=15, max_size=15)
 @given(NOISE, st.sampled_from(METHODS))
 @settings(max_examples=200, deadline=None)
 def test_nearly_straight_stays_nearly_straight(noise, method):
-    """Noise of up to 0.1 mm on the modules and 1e-4 rad on tangents never throws a curve in space far off."""
+    """
+    Noise on modules and tangents never throws a curve in space far off.
+
+    Up to 0.1 mm on the modules and 1e-4 rad on tangents.
+    """
     points, tangents, truth = nearly_straight(noise)
     assert errors(curves.fit_curve(points, tangents, method), truth).max() < 6e-4
 
@@ -100,10 +112,10 @@ def test_the_projected_forms_do_not_fail_on_noise(noise, method):
 
 def test_the_projected_arc_takes_a_zigzag_for_a_bend():
     """
-    Distances from the axis are never negative, so noise about it reads as a one-sided zigzag, for
-    which Kasa's
-    algebraic fit prefers a small circle: 0.1 mm of noise becomes 1 mm. The spatial arc does not
-    fall for it.
+    Distances from the axis are never negative, so noise about it reads as a zigzag.
+
+    It is one-sided, and Kasa's algebraic fit prefers a small circle for it: 0.1 mm of noise
+    becomes 1 mm. The spatial arc does not fall for it.
     """
     points, tangents, truth = nearly_straight(
         [0, 0, 7.0e-5, 0, 0, 4.2e-5, 0, 9.5e-5, 5.5e-5, *[0.0] * 6]
@@ -158,7 +170,11 @@ def test_cubic_passes_through_its_four_points_at_thirds():
 
 
 def test_printed_kappa_points_the_wrong_way():
-    """Tangents of a quarter circle meet at its corner; eq. 14 as printed puts the control point opposite."""
+    """
+    Tangents of a quarter circle meet at its corner.
+
+    Eq. 14 as printed puts the control point opposite.
+    """
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 3.0, 0.0]])
     tangents = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     mended = curves.fit_curve(points, tangents, 'quadratic_bezier', projected=True, samples=5)

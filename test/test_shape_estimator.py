@@ -63,7 +63,11 @@ def recording(arm):
 
 
 def test_simulated_gyro_and_accelerometer_agree_with_the_motion():
-    """Integrating a perfect arm's gyro gives its rotation; at rest it reads g along the true up."""
+    """
+    Integrating a perfect arm's gyro gives its rotation.
+
+    At rest it reads g along the true up.
+    """
     arm = Arm(ROBOT, PERFECT)
     strain = out_of_plane(ROBOT, 20.0)
     samples = arm.record(groove_motion(arm, strain, rest=0.5, travel=1.0, hold=0.5))
@@ -194,7 +198,11 @@ def test_joint_fit_recovers_arcs_from_fields_and_attitudes_alike():
 
 
 def test_joint_fit_bridges_a_module_that_says_nothing(arm, calibration, recording):
-    """Without the middle module's readings its pose is the backbone's, still within a tenth of a millimetre."""
+    """
+    Without the middle module's readings its pose is the backbone's.
+
+    Still within a tenth of a millimetre.
+    """
     begin = recording[0].stamp
     kept = [
         s for s in recording if seconds(s.stamp, begin) < 1.5 or not s.sensor.startswith('module2')
@@ -237,8 +245,9 @@ def test_chain_of_arcs_differentiates_on_the_right():
 )
 def test_perfect_arm_is_found_exactly(position, strain):
     """
-    No noise: only quantisation (0.24 uT at most, some 0.02 mm at 75 mm) and the gyro's integration
-    are left.
+    No noise: only quantisation and the gyro's integration are left.
+
+    Quantisation: 0.24 uT at most, some 0.02 mm at 75 mm.
 
     The joint fit's prior on curvature holds it back by up to 0.15 mm.
     """
@@ -261,7 +270,11 @@ def test_perfect_arm_is_found_exactly(position, strain):
 
 @pytest.mark.parametrize('groove', GROOVES)
 def test_calibrated_arm_finds_the_grooves(arm, calibration, groove):
-    """Arc MAE well under the paper's 0.02 / 0.70 / 0.84 mm, but for one arm's noise in the straight groove."""
+    """
+    Arc MAE well under the paper's 0.02 / 0.70 / 0.84 mm.
+
+    But for one arm's noise in the straight groove.
+    """
     strain = bent(ROBOT, GROOVES[groove], 0.6)
     last = estimates(
         ShapeEstimator(ROBOT, calibration=calibration), arm.record(groove_motion(arm, strain))
@@ -276,9 +289,10 @@ def test_calibrated_arm_finds_the_grooves(arm, calibration, groove):
 
 def test_stated_covariance_covers_the_errors():
     """
-    Normalised squared error of the positions of 6 arms: 54 values of mean 1 if honest and
-    independent; they are not quite (one calibration serves three modules), so only gross over- and
-    underconfidence fails.
+    Normalised squared error of the positions of 6 arms.
+
+    54 values of mean 1 if honest and independent; they are not quite (one calibration serves three
+    modules), so only gross over- and underconfidence fails.
     """
     nees = []
     for seed in range(6):
@@ -347,7 +361,11 @@ def test_every_fault_is_told_for_what_it_is():
 
 @pytest.mark.parametrize('fault', ['silent', 'frozen'])
 def test_module_that_comes_back_is_taken_up_again(arm, calibration, fault):
-    """Module 2 is lost for 1.4 s on the way into the groove; back, it knows its rotation from the backbone."""
+    """
+    Module 2 is lost for 1.4 s on the way into the groove.
+
+    Back, it knows its rotation from the backbone.
+    """
     strain = bent(ROBOT, 12.5, 0.6)
     samples = arm.record(groove_motion(arm, strain))
     begin, last, stream = samples[0].stamp, {}, []

@@ -102,7 +102,11 @@ def test_dipole_on_axis_and_on_the_equator():
 
 
 def test_the_ring_is_no_dipole_at_the_modules():
-    """The distance a dipole would read from the ring's field on the axis is off by 0.59, 0.21 and 0.13 mm."""
+    """
+    The distance that a dipole would read from the ring's field on the axis is off.
+
+    By 0.59, 0.21 and 0.13 mm.
+    """
     p = np.column_stack([ARCLENGTHS, 0 * ARCLENGTHS, 0 * ARCLENGTHS])
     read = invert_dipole(MAGNET, ring_field(MAGNET, p))[:, 0]
     np.testing.assert_allclose((read - ARCLENGTHS) * 1e3, [0.59, 0.21, 0.13], atol=0.006)
@@ -161,7 +165,11 @@ def test_positions_come_back_from_their_fields(places, model):
 
 
 def test_optimum_on_the_bounds_is_the_constrained_one():
-    """A field from beyond the module's reach: SciPy's bounded solvers end on the same face of the box."""
+    """
+    A field from beyond the module's reach.
+
+    SciPy's bounded solvers end on the same face of the box.
+    """
     solver = PositionSolver(MAGNET, ARCLENGTHS)
     p = np.array([[0.030, 0.004, 0.0], [0.040, 0.056, 0.0], [0.07, 0.0, 0.02]])
     field = ring_field(MAGNET, p)
@@ -208,7 +216,11 @@ def test_agrees_with_the_interior_point_minimiser():
 
 
 def test_covariance_is_what_many_noisy_solutions_spread():
-    """2000 draws of noise and attitude error: the sample variance has a relative sigma of 3.2 %, so 5 sigma is 16 %."""
+    """
+    2000 draws of noise and attitude error.
+
+    The sample variance has a relative sigma of 3.2 %, so 5 sigma is 16 %.
+    """
     rng = np.random.default_rng(5)
     p = np.array([[0.0234, 0.0076, 0.0], [0.038, 0.0274, 0.0], [0.0382, 0.052, 0.0]])
     solver, sigma, attitude = PositionSolver(MAGNET, ARCLENGTHS), 1e-6, np.radians(0.3)

@@ -1,4 +1,8 @@
-"""Campaigns lose no trial and repeat none; the split is kept; benchmarks and tuning judge as they say."""
+"""
+Campaigns lose no trial and repeat none; the split is kept.
+
+Benchmarks and tuning judge as they say.
+"""
 
 from dataclasses import replace
 import json

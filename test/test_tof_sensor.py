@@ -1,6 +1,7 @@
 """
-ToF sensors: hit geometry against analytic answers and MuJoCo's rays; noise and faults against
-their models.
+ToF sensors: hit geometry against analytic answers and MuJoCo's rays.
+
+Noise and faults against their models.
 
 Statistical tests use fixed seeds and thresholds with a false-alarm rate of 1e-4 each, should the
 seed change.
@@ -41,7 +42,11 @@ def scene_of_mesh(mesh: trimesh.Trimesh, reflectance: float = 0.5) -> Scene:
 
 
 def wall(distance: float, reflectance: float = 0.88, yaw_deg: float = 0.0) -> Scene:
-    """A large slab whose near face crosses the x axis at a distance; yawed about that point."""
+    """
+    Make a large slab whose near face crosses the x axis at a distance.
+
+    It is yawed about that point.
+    """
     slab = trimesh.creation.box((0.1, 40.0, 40.0))
     slab.apply_translation((0.05, 0.0, 0.0))
     slab.apply_transform(
@@ -99,8 +104,10 @@ def test_miss_is_infinite_and_has_no_face():
 
 def test_mesh_hits_agree_with_mujoco():
     """
-    Embree and MuJoCo's own ray caster on a concave mesh: surfaces within a micrometre, measured
-    square to them (both keep vertices in single precision, which a grazing ray amplifies).
+    Embree and MuJoCo's own ray caster on a concave mesh.
+
+    Surfaces agree within a micrometre, measured square to them (both keep vertices in single
+    precision, which a grazing ray amplifies).
     """
     mesh = trimesh.creation.torus(0.6, 0.2, major_sections=40, minor_sections=24)
     mesh.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9])))
@@ -371,7 +378,11 @@ def test_two_far_surfaces_give_the_strongest_or_the_closest(order, expected):
 
 
 def test_light_of_a_bright_zone_drowns_its_faint_neighbours():
-    """One zone at 5 cm leaks into eight neighbours at 2 m, which are flagged and carry no range."""
+    """
+    One zone at 5 cm leaks into eight neighbours at 2 m.
+
+    They are flagged and carry no range.
+    """
     depth = np.full((64, 1), 2.0)
     depth[27] = 0.05
     flagged = read(Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'crosstalk': 0.01})), depth)
@@ -423,7 +434,11 @@ def test_zones_keep_their_order_under_flips_and_grids(flips):
 
 
 def test_the_ideal_sensor_reduces_to_geometry():
-    """In the box, zones that see one surface agree with the central ray to the noise and the slope's curvature."""
+    """
+    In the box, zones that see one surface agree with the central ray.
+
+    To the noise and the slope's curvature.
+    """
     poses = _in_the_box()[None]
     real = sensor(load_scene('R0'), 'vl53l5cx').measure(poses, ['tof'], 1)[0]
     paper = sensor(load_scene('R0'), 'paper').measure(poses, ['tof'], 1)[0]

@@ -1,4 +1,8 @@
-"""The filter as a whole in an analytic world: accuracy, honesty, late and bad data, being lost and found."""
+"""
+The filter as a whole in an analytic world.
+
+Accuracy, honesty, late and bad data, being lost and found.
+"""
 
 from dataclasses import replace
 
@@ -42,7 +46,11 @@ def run(filter_: SlidingWindowFilter, samples) -> tuple[list, dict]:
 
 
 def errors(estimates, truth) -> np.ndarray:
-    """(K, R + 1, 6) body-frame pose errors of the estimates that have a true pose at their stamp."""
+    """
+    (K, R + 1, 6) body-frame pose errors of the estimates that have a true pose.
+
+    At their stamp.
+    """
     return np.array(
         [
             lie.log(lie.inverse(e.T_map_ring) @ truth[e.stamp])
@@ -157,7 +165,11 @@ def test_invalid_zones_carry_no_information(prior_map):
 
 
 def test_a_gap_is_bridged_with_growing_covariance(prior_map):
-    """Half a second with gyros alone: the covariance grows, the error stays inside it, and both shrink again."""
+    """
+    Half a second with gyros alone.
+
+    The covariance grows, the error stays inside it, and both shrink again.
+    """
     robot = rod()
     samples = [
         s
@@ -176,7 +188,11 @@ def test_a_gap_is_bridged_with_growing_covariance(prior_map):
 
 
 def test_gyro_bias_is_found_at_rest(prior_map):
-    """Within four sigmas of the rest's mean (0.01 rad/s over 50 samples, and 0.002 rad/s for rest not being rest)."""
+    """
+    Within four sigmas of the rest's mean.
+
+    0.01 rad/s over 50 samples, and 0.002 rad/s for rest not being rest.
+    """
     robot = rod()
     bias = {'r1_imu': np.array([0.05, -0.06, 0.04]), 'r2_imu': np.array([-0.05, 0.06, 0.045])}
     biased = [
@@ -195,7 +211,11 @@ def test_gyro_bias_is_found_at_rest(prior_map):
 
 @pytest.mark.parametrize('seed', range(3))
 def test_finds_itself_from_the_base_alone(prior_map, seed):
-    """Without strain and bent from the first moment: the search along the body must find the shape."""
+    """
+    Without strain and bent from the first moment.
+
+    The search along the body must find the shape.
+    """
     robot = rod(strain=False)
     motion = Rod(robot, seed=seed, amplitude=1.8)
     filter_ = SlidingWindowFilter(robot, prior_map, settings(recovery={'max_curvature': 2.0}))
@@ -215,7 +235,11 @@ def test_memory_is_bounded(prior_map):
 
 
 def test_queries_agree_with_the_estimate_and_reach_behind_and_ahead(prior_map):
-    """Any time and arclength: rings as published, truth within 4 sigmas between them, growth ahead of the window."""
+    """
+    Any time and arclength can be asked for.
+
+    Rings as published, truth within 4 sigmas between them, growth ahead of the window.
+    """
     robot = rod()
     motion = Rod(robot, seed=4)
     filter_ = SlidingWindowFilter(robot, prior_map, settings())
@@ -251,7 +275,11 @@ def test_the_batch_smoother_beats_the_filter(prior_map):
 
 
 def test_a_frozen_sensor_is_refused_and_a_wrong_extrinsic_named(prior_map):
-    """A sensor that repeats itself is dropped; one that is mounted 20 degrees off is suspected, and neither hurts."""
+    """
+    A sensor that repeats itself is dropped, and one mounted 20 degrees off is suspected.
+
+    Neither hurts.
+    """
     robot = rod()
     turn = lie.exp(np.radians([0, 0, 0, 0, 0, 20.0]))[:3, :3]
     first: dict = {}
@@ -271,8 +299,9 @@ def test_a_frozen_sensor_is_refused_and_a_wrong_extrinsic_named(prior_map):
 
 def test_field_gravity_and_gyros_track_the_hall_arm():
     """
-    The arm of the second paper, bent freely by its tendons: no map, no strain, only the magnet at
-    its base.
+    The arm of the second paper, bent freely by its tendons.
+
+    No map, no strain, only the magnet at its base.
 
     Told Earth's field it is good to 0.2 mm; not told, ten times worse, as Earth's is a tenth of
     the magnet's.

@@ -1,4 +1,8 @@
-"""The simulated world is consistent with itself: every sensor agrees with the truth, and seeds decide everything."""
+"""
+The simulated world is consistent with itself.
+
+Every sensor agrees with the truth, and seeds decide everything.
+"""
 
 from collections import Counter, defaultdict
 import dataclasses
@@ -32,7 +36,7 @@ FALSE_ALARM = 1e-3  # of each statistical test; the seeds are fixed, so a pass s
 
 
 def quiet(robot):
-    """The same robot with sensors that add next to nothing to the truth."""
+    """Quieten the robot: its sensors add next to nothing to the truth."""
     imu = robot.imu_model.model_copy(
         update={'gyro_sigma': 1e-12, 'accel_sigma': 1e-12, 'gyro_bias_sigma': 0.0}
     )
@@ -102,7 +106,11 @@ def test_the_first_second_is_at_rest_and_then_the_tip_sweeps_decimetres(truth):
 
 
 def test_gyros_are_the_derivative_of_the_true_rotation(engine, truth):
-    """Over a sampling interval the mean of two samples differs from the chord by terms of second order."""
+    """
+    Over a sampling interval the mean of two samples differs little from the chord.
+
+    By terms of second order.
+    """
     for ring in (1, 3, 5):
         gyro = np.array([s.angular_velocity for s in engine.of(ImuSample, f'ring{ring}_imu')])
         chord = (
@@ -149,7 +157,11 @@ def test_insertion_follows_its_command(engine, truth):
 
 
 def test_tendon_encoders_are_the_change_of_their_channels_length(engine):
-    """A channel at offset r from a bent backbone is shorter by the integral of r x curvature along x."""
+    """
+    A channel at offset r from a bent backbone is shorter by an integral.
+
+    That of r x curvature along x.
+    """
     plant = load_plant('engine')
     group = plant.tendons[1]
     last = int(np.argmin(np.abs(engine.nodes_s - group.end)))
@@ -164,7 +176,11 @@ def test_tendon_encoders_are_the_change_of_their_channels_length(engine):
 
 
 def test_integrated_strain_reproduces_the_rings(engine, truth):
-    """From the base, the reported curvature alone (held for the spacing round each station) leads to every ring."""
+    """
+    From the base, the reported curvature alone leads to every ring.
+
+    It is held for the spacing round each station.
+    """
     robot = load_robot('engine')
     for index in (0, 60, 119):
         sample = engine.of(StrainSample)[index]
@@ -205,7 +221,7 @@ def test_full_state_passes_through_the_rings_with_the_tangent_along_x(engine, tr
 
 
 def helix(time):
-    """A frame in screw motion: its body twist is constant, its pose known at every time."""
+    """Move a frame in screw motion: its body twist is constant, its pose known at every time."""
     twist = np.array([0.3, -0.1, 0.2, 1.0, -2.0, 0.5])
     return lie.exp(time * twist), twist
 
@@ -299,7 +315,11 @@ def test_leaving_a_sensor_out_does_not_change_the_others():
 
 
 def test_tof_ranges_are_those_of_the_true_pose_at_their_own_stamps(scene):
-    """Rays cast anew from the true ring poses meet the scene where the frame says, in motion and between steps."""
+    """
+    Rays cast anew from the true ring poses meet the scene where the frame says.
+
+    In motion and between steps.
+    """
     from continuum_loc.simulator.raycast import RayCaster
 
     robot = load_robot('engine')
@@ -467,7 +487,11 @@ def test_there_are_enough_trajectories_and_seeds_vary_them():
 
 @pytest.mark.parametrize('robot', ['engine', 'soft_arm'])
 def test_contacts_hold_the_body_out_of_the_scene(robot):
-    """Throughout, no node comes nearer to the mesh than the body's radius less a few millimetres."""
+    """
+    Throughout, no node comes nearer to the mesh than the body's radius.
+
+    Less a few millimetres.
+    """
     from continuum_loc.simulator.scenes import load_scene
     import open3d as o3d
 

@@ -1,6 +1,7 @@
 """
-A small analytic world for the filter's tests: a bent rod that moves by a formula, in a room of
-planes.
+A small analytic world for the filter's tests.
+
+A bent rod that moves by a formula, in a room of planes.
 
 Everything is exact and needs no simulator: constant-curvature segments between rings, rays against
 planes.
@@ -24,7 +25,11 @@ EPOCH = 1_000_000_000
 
 
 def rod(strain: bool = True, tof: bool = True) -> RobotDescription:
-    """A rod of 0.6 m with rings at 0.3 m and 0.6 m, three radial ToF sensors each and one at the tip."""
+    """
+    Describe a rod of 0.6 m with rings at 0.3 m and 0.6 m.
+
+    Three radial ToF sensors each and one at the tip.
+    """
     sensors = [
         {
             'name': f'r{r}_tof{i}',
@@ -98,7 +103,7 @@ def cast(origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 
 def room_map(spacing: float = 0.02) -> PriorMap:
-    """The room's walls as a map, with exact normals."""
+    """Make a map of the room's walls, with exact normals."""
     points, normals = [], []
     for axis in range(3):
         u, v = (i for i in range(3) if i != axis)
@@ -120,7 +125,7 @@ def room_map(spacing: float = 0.02) -> PriorMap:
 
 
 def stream(rod_: Rod, duration: float, seed: int = 0, start: float = 0.0) -> Iterator:
-    """Samples with datasheet noise and TruthSamples, in the order of their stamps."""
+    """Yield samples with datasheet noise and TruthSamples, in the order of their stamps."""
     rng, robot = np.random.default_rng(seed), rod_.robot
     tick = 1.0 / 300.0
     for k in range(int(round(start / tick)), int(round((start + duration) / tick)) + 1):
