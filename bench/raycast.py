@@ -167,12 +167,13 @@ def _rangefinders(scene: Scene, origins: np.ndarray, rays: np.ndarray) -> Action
             for j, ray in enumerate(fan):
                 site = head.add_site(name=f'zone_{i}_{j}', pos=origin)
                 site.alt.type, site.alt.zaxis = mujoco.mjtOrientation.mjORIENTATION_ZAXIS, ray
+                # Distance alone.
                 spec.add_sensor(
                     type=mujoco.mjtSensor.mjSENS_RANGEFINDER,
                     objtype=mujoco.mjtObj.mjOBJ_SITE,
                     objname=f'zone_{i}_{j}',
                     intprm=[1, 0, 0],
-                )  # distance alone
+                )
 
     model, data = _mujoco_scene(scene, add_sensors)
     expected = _ours(RayCaster(scene), origins, rays)()[0]

@@ -48,9 +48,8 @@ def run(quick: bool = False) -> list[dict]:
             'startup, continuum-loc --help': ['-m', 'continuum_loc.cli', '--help'],
             'startup, first estimate': ['-c', program],
         }
-        _timed(
-            commands['startup, first estimate']
-        )  # builds the map and compiles, if that has not been done yet
+        # Builds the map and compiles, if that has not been done yet.
+        _timed(commands['startup, first estimate'])
         return [
             _row(name, [_timed(command) for _ in range(repeats)])
             for name, command in commands.items()

@@ -91,7 +91,9 @@ class Insertion(Settings):
         description='fixed at 0; measured by the `insertion` joint state; '
         'or unknown within `range`',
     )
-    range: tuple[float, float] = Field((0.0, 0.0), description='least and greatest travel [m]')
+    range: tuple[float, float] = Field(  # noqa: A003  (a name in robot descriptions)
+        (0.0, 0.0), description='least and greatest travel [m]'
+    )
     sigma: float = Field(0.0005, gt=0.0, description='standard deviation of the encoder [m]')
 
 

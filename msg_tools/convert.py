@@ -189,9 +189,8 @@ def tof_message(make: Messages, frame: TofFrame) -> Any:
     """PointCloud2 of a ToF frame; a square number of zones is organised as rows x columns."""
     side = isqrt(len(frame.ranges))
     shape = (side, side) if side * side == len(frame.ranges) else (1, len(frame.ranges))
-    array = np.zeros(
-        len(frame.ranges), TOF_DTYPE
-    )  # zeroed: the padding bytes must not vary between runs
+    # Zeroed: the padding bytes must not vary between runs.
+    array = np.zeros(len(frame.ranges), TOF_DTYPE)
     array['x'], array['y'], array['z'] = frame.points.T
     array['range'], array['sigma'], array['status'] = frame.ranges, frame.sigma, frame.status
     return cloud_message(

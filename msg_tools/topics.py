@@ -28,7 +28,7 @@ class Topic:
     latched: the last message is kept for late joiners. depth: messages a queue holds.
     """
 
-    type: str
+    type: str  # noqa: A003  (ROS's word)
     encode: Callable[[Messages, Any], Any]
     decode: Callable[[Any, int | None, str], Any]
     latched: bool = False

@@ -5,9 +5,25 @@ Only a change does. To search anew: HYPOTHESIS_PROFILE=explore make test.
 """
 
 import os
+import re
 
 from hypothesis import settings
+import pytest
 
 settings.register_profile('same', derandomize=True)
 settings.register_profile('explore')
 settings.load_profile(os.environ.get('HYPOTHESIS_PROFILE', 'same'))
+
+
+class NodeModule(pytest.Module):
+    """Tests that need a ROS graph: skipped before their imports fail where there is no rclpy."""
+
+    def collect(self):
+        pytest.importorskip('rclpy', reason='rclpy is not installed')
+        return super().collect()
+
+
+def pytest_pycollect_makemodule(module_path, parent):
+    if re.search(r'^from (rclpy|node_graph)\b', module_path.read_text(), re.MULTILINE):
+        return NodeModule.from_parent(parent, path=module_path)
+    return None

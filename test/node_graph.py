@@ -14,11 +14,6 @@ import subprocess
 import sys
 import time
 
-import numpy as np
-import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.measurements import (
     EncoderSample,
     ImuSample,
@@ -30,6 +25,8 @@ from continuum_loc.nodes.runtime import output_qos
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.topics import topic_spec
+import numpy as np
+import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -55,9 +52,8 @@ imu: [{name: imu1, ring: ring1}, {name: imu2, ring: ring2}]
 BOX = np.array([[-0.2, -0.3, -0.3], [0.6, 0.3, 0.3]])
 
 
-MATCHED = (
-    0.5  # s: the other side learns of a subscription about when this side learns of the publisher
-)
+# [s] the other side learns of a subscription about when this side learns of the publisher.
+MATCHED = 0.5
 
 
 def fresh_domain() -> int:
@@ -216,9 +212,8 @@ class BoxRobot:
         self.path.write_text(ROBOT)
         self.robot = load_robot(self.path)
         self._write_map()
-        self._rng = np.random.default_rng(
-            0
-        )  # a sensor that repeats itself to the last bit counts as frozen
+        # A sensor that repeats itself to the last bit counts as frozen.
+        self._rng = np.random.default_rng(0)
         self.T_map_ring = np.tile(np.eye(4), (3, 1, 1))
         self.T_map_ring[1:, 0, 3] = self.robot.ring_arclengths
 

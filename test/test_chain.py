@@ -27,8 +27,9 @@ def dense(start, intervals):
     H[:D, :D] += start.information
     g[:D] += start.gradient
     for k, block in enumerate(intervals):
-        H[D * k : D * (k + 2), D * k : D * (k + 2)] += block.H
-        g[D * k : D * (k + 2)] += block.g
+        at = slice(D * k, D * (k + 2))
+        H[at, at] += block.H
+        g[at] += block.g
     return H, g
 
 

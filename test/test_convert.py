@@ -354,9 +354,8 @@ def _bad_clouds():
         setattr(message.fields[0], name, value)
         yield kind, text, message
     perpendicular = _tof()
-    perpendicular.ranges[:] = perpendicular.points[
-        :, 0
-    ]  # the distance along the axis instead of along the ray
+    # The distance along the axis instead of along the ray.
+    perpendicular.ranges[:] = perpendicular.points[:, 0]
     yield (
         'range',
         "is not the point's distance",

@@ -25,9 +25,8 @@ def test_a_wall_across_the_axis_is_flat(distance):
     np.testing.assert_allclose(frame.points[:, 0], distance / 1000)
     np.testing.assert_allclose(frame.ranges, np.linalg.norm(frame.points, axis=1))
     assert frame.ranges.max() / frame.ranges.min() > 1.1
-    back = tof_frame(
-        tof_message(bag_messages(), frame)
-    )  # and the message is accepted as consistent
+    # And the message is accepted as consistent.
+    back = tof_frame(tof_message(bag_messages(), frame))
     np.testing.assert_allclose(back.ranges, frame.ranges, rtol=1e-6)
 
 

@@ -26,9 +26,8 @@ import pytest
 from worlds import EPOCH, Rod, rod, room_map, stream
 
 DT = 0.1
-LOOSE = {
-    'cauchy': 1e6
-}  # the loss is frozen per iteration, so only the quadratic part has a gradient to compare
+# The loss is frozen per iteration, so only the quadratic part has a gradient to compare.
+LOOSE = {'cauchy': 1e6}
 SETTINGS = parse_settings(
     EstimatorSettings,
     {
@@ -111,25 +110,25 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
     a, b = columns(grid, seed)
     blocks = Blocks.zeros(grid.dim)
     factor.linearise(batch, a, b, blocks)
-    rng = np.random.default_rng(seed)
+    rng, bias = np.random.default_rng(seed), grid.bias_offset
     for _ in range(8):
         x, step = rng.normal(size=2 * grid.dim), 1e-6
+        x_a, x_b = np.split(x, 2)
         if kind == 'gravity':
-            x[grid.bias_offset : grid.dim] = 0.0
+            x_a[bias:] = 0.0
         ends = [
             factor.linearise(
                 batch,
-                a.retract(sign * step * x[: grid.dim]),
-                b.retract(sign * step * x[grid.dim :]),
+                a.retract(sign * step * x_a),
+                b.retract(sign * step * x_b),
                 Blocks.zeros(grid.dim),
             ).squared
             for sign in (1.0, -1.0)
         ]
         slope = (ends[0] - ends[1]) / (4.0 * step)
         scale = np.linalg.norm(blocks.g) * np.linalg.norm(x) / np.sqrt(len(x))
-        if (
-            kind == 'tof'
-        ):  # planarity weighs the information, not the reported squares; here it is one everywhere
+        if kind == 'tof':
+            # Planarity weighs the information, not the reported squares; here it is one.
             assert np.all(factor._planarity == 1.0)
         assert slope == pytest.approx(blocks.g @ x, abs=1e-5 * scale + 1e-6 * abs(slope))
 
@@ -157,15 +156,16 @@ def test_prior_gradient(seed):
 
     def blocks_at(x):
         out = Blocks.zeros(grid.dim)
-        priors.add(out, a.retract(x[: grid.dim]), b.retract(x[grid.dim :]))
+        x_a, x_b = np.split(x, 2)
+        priors.add(out, a.retract(x_a), b.retract(x_b))
         return out
 
     centre, rng = blocks_at(np.zeros(2 * grid.dim)), np.random.default_rng(seed)
+    bias = grid.bias_offset
     for _ in range(8):
         x, step = rng.normal(size=2 * grid.dim), 1e-6
-        x[grid.bias_offset : grid.dim] = x[grid.dim + grid.bias_offset :] = (
-            0.0  # the bias walk reports no cost
-        )
+        for one in np.split(x, 2):
+            one[bias:] = 0.0  # the bias walk reports no cost
         slope = (blocks_at(step * x).cost - blocks_at(-step * x).cost) / (2.0 * step)
         assert slope == pytest.approx(centre.g @ x, rel=1e-6)
     np.testing.assert_allclose(centre.H, centre.H.T, atol=1e-12 * np.abs(centre.H).max())

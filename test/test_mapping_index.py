@@ -76,9 +76,8 @@ def test_nearest_facing_is_the_nearest_that_faces(seed, min_cos, max_distance):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     index = VoxelIndex(points, normals)
     cosine = -np.einsum('qi,pi->qp', directions, normals)
-    clear = (
-        np.abs(cosine - min_cos).min(axis=1) > 1e-12
-    )  # rounding may decide either way on the limit itself
+    # Rounding may decide either way on the limit itself.
+    clear = np.abs(cosine - min_cos).min(axis=1) > 1e-12
     expected = brute_force(points, queries, max_distance, cosine >= min_cos)
     for _ in range(PATIENCE + 1):
         _, distance = index.nearest_facing(queries, directions, max_distance, min_cos)

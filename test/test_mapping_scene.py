@@ -163,9 +163,8 @@ def test_zones_that_see_the_robot_itself_are_dropped_and_counted():
     frame = measured(trajectory, room(), noise=False)[0]
     T_ring_sensor = ROBOT.sensor(frame.sensor).mount.T_ring_sensor
     points = frame.points.copy()
-    points[:5] = (lie.inverse(T_ring_sensor) @ np.array([-0.05, 0.0, 0.03, 1.0]))[
-        :3
-    ]  # beside the backbone
+    # Beside the backbone.
+    points[:5] = (lie.inverse(T_ring_sensor) @ np.array([-0.05, 0.0, 0.03, 1.0]))[:3]
     touched = TofFrame(frame.stamp, frame.sensor, points, frame.ranges, frame.sigma, frame.status)
     cloud = reconstruct(ROBOT, [touched], trajectory)
     assert cloud.on_body == 5 and len(cloud.points) == 59

@@ -89,9 +89,8 @@ def test_known_offset_is_reported_exactly():
     assert figures['rings']['ring2']['translation_mae_m'] == pytest.approx(0.005, abs=1e-12)
     assert figures['rings']['ring2']['rotation_rmse_deg'] == pytest.approx(2.0, abs=1e-9)
     assert figures['rings']['ring1']['translation_mae_m'] == pytest.approx(0.0, abs=1e-12)
-    assert figures['translation_mae_m'] == pytest.approx(
-        0.0025, abs=1e-12
-    )  # over both rings, without the base
+    # Over both rings, without the base.
+    assert figures['translation_mae_m'] == pytest.approx(0.0025, abs=1e-12)
     assert np.isnan(figures['nees_per_dof'])  # no covariance was given, and none is invented
 
 
@@ -157,9 +156,8 @@ def test_instants_without_truth_are_left_out():
     gap = truth.select((np.arange(100) < 20) | (np.arange(100) >= 60))
     late = Track(truth.stamps + 5 * NANOSECONDS, NAMES, truth.T_map_ring)
     assert len(associate(late, truth)[0]) == 0
-    assert (
-        len(associate(truth, gap, longest_gap=0.2)[0]) == 60
-    )  # the 40 samples inside the gap of 0.41 s go
+    # The 40 samples inside the gap of 0.41 s go.
+    assert len(associate(truth, gap, longest_gap=0.2)[0]) == 60
     assert np.isnan(summarise(errors(late, truth))['translation_mae_m'])
 
 

@@ -8,17 +8,14 @@ import json
 from pathlib import Path
 import signal
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.measurements import nanoseconds, TofFrame
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import tracker_message
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
 from node_graph import BoxRobot, Client, fresh_domain, Process, wait_until
+import numpy as np
+import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -93,9 +90,8 @@ def test_every_output_comes_and_is_right(fresh, box):
     assert np.linalg.eigvalsh(tip.covariance).min() > 0.0 and np.abs(tip.velocity).max() < 0.1
     backbone = client.heard['backbone'][-1].T_map_backbone[:, :3, 3]
     steps = np.linalg.norm(np.diff(backbone, axis=0), axis=1)
-    np.testing.assert_allclose(
-        steps, box.robot.length / (len(backbone) - 1), rtol=0.02
-    )  # evenly spaced
+    # Evenly spaced.
+    np.testing.assert_allclose(steps, box.robot.length / (len(backbone) - 1), rtol=0.02)
     points = client.heard['reconstruction'][-1].points
     assert len(points) >= 64 and _distance_to_box(points).max() < 0.02
     assert {pose.stamp for pose in poses} <= set(stamps)  # the sensors' stamps, never the arrival

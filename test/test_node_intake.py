@@ -9,11 +9,6 @@ from dataclasses import replace
 import threading
 import time
 
-import numpy as np
-import pytest
-
-pytest.importorskip('numba')
-
 from continuum_loc.measurements import (
     EncoderSample,
     ImuSample,
@@ -29,6 +24,8 @@ from continuum_loc.nodes.warm_up import rest_samples
 from continuum_loc.robot import load_robot
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.topics import topic_spec
+import numpy as np
+import pytest
 
 SECOND = 10**9
 START = 1000 * SECOND
@@ -106,7 +103,7 @@ def test_old_tof_frames_are_dropped_and_counted_while_all_else_is_kept():
         time.sleep(0.02)
     kept = list(iter(lambda: inbox.take(0.0), None))
     frames = [item.message for item in kept if item.topic == 'tof/points']
-    assert frames == list(range(10))[-len(frames) :] and 1 <= len(frames) <= 4
+    assert frames == list(range(10 - len(frames), 10)) and 1 <= len(frames) <= 4
     assert inbox.dropped == {'tof/points': 10 - len(frames)}
     assert [item.message for item in kept if item.topic == 'imu/data_raw'] == list(range(10))
 
@@ -137,16 +134,14 @@ def test_zero_future_and_doubled_stamps_are_told_apart():
     now = START + SECOND
     assert gate.judge(0, 'a', now) == 'zero stamp'
     assert gate.judge(now + 2 * SECOND, 'a', now) == 'future stamp'
-    assert (
-        gate.judge(now + 2 * SECOND, 'a', 0) is None
-    )  # a simulated clock that has not begun judges nobody
+    # A simulated clock that has not begun judges nobody.
+    assert gate.judge(now + 2 * SECOND, 'a', 0) is None
     gate.reset()
     assert gate.judge(START, 'a', now) is None
     assert gate.judge(START, 'a', now) == 'duplicate'
     assert gate.judge(START, 'b', now) is None
-    assert (
-        gate.judge(START - SECOND // 10, 'b', now) is None
-    )  # late, but within what the window may use
+    # Late, but within what the window may use.
+    assert gate.judge(START - SECOND // 10, 'b', now) is None
 
 
 @pytest.mark.parametrize(('leap', 'restarts'), [(-100 * SECOND, 1), (+100 * SECOND, 0)])
@@ -164,9 +159,8 @@ def test_lone_wild_stamps_never_move_the_clock():
     accepted = 0
     for k in range(2000):
         if k % 3 == 0:
-            gate.judge(
-                int(rng.integers(1, 10**6) * SECOND), 'a', 0
-            )  # the very first has to be believed
+            # The very first has to be believed.
+            gate.judge(int(rng.integers(1, 10**6) * SECOND), 'a', 0)
         else:
             accepted += gate.judge(START + k * SECOND // 100, 'a', 0) is None
     assert accepted >= 1300 and gate.restarts == 1

@@ -7,11 +7,6 @@ Files are checked, and the YAML of every node is in step.
 import contextlib
 from pathlib import Path
 
-import pytest
-import yaml
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes import parameters
 from continuum_loc.nodes.runtime import PackageNode
@@ -19,9 +14,12 @@ from continuum_loc.nodes.settings import EstimatorNodeSettings
 from continuum_loc.nodes.write_config import config_text, NODES
 from continuum_loc.settings import SettingsError
 from node_graph import fresh_domain
+import pytest
 from rcl_interfaces.msg import ParameterType
+import rclpy
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+import yaml
 
 CONFIG = Path(__file__).resolve().parent.parent / 'config'
 

@@ -9,15 +9,12 @@ import json
 from pathlib import Path
 import signal
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.measurements import TofFrame
 from continuum_loc.robot import load_robot
 from msg_tools.bag import open_bag, raw_messages, read_bag
 from node_graph import Client, fresh_domain, Process, wait_until
+import numpy as np
+import pytest
 from rosgraph_msgs.msg import Clock
 
 pytestmark = pytest.mark.timeout(300)

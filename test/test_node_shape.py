@@ -6,13 +6,10 @@ A straight Hall + IMU arm at rest, then bent, from the analytic simulation.
 
 import signal
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.robot import load_robot
 from node_graph import Client, fresh_domain, Process
+import numpy as np
+import pytest
 from std_srvs.srv import Trigger
 
 pytestmark = pytest.mark.timeout(300)

@@ -5,14 +5,11 @@ import re
 import urllib.error
 import urllib.request
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc import lie
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord
 from node_graph import Client, fresh_domain, Process
+import numpy as np
+import pytest
 
 pytestmark = pytest.mark.timeout(200)
 

@@ -37,9 +37,8 @@ def covered(image):
 def test_a_sphere_covers_the_disc_of_its_tangent_cone():
     camera = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), fov_deg=45.0, width=200, height=200)
     image = render([sphere()], camera)
-    tangent = np.tan(np.arcsin(0.5 / 2.0)) / np.tan(
-        np.radians(22.5)
-    )  # of half the picture's width
+    # Of half the picture's width.
+    tangent = np.tan(np.arcsin(0.5 / 2.0)) / np.tan(np.radians(22.5))
     assert covered(image).mean() == pytest.approx(np.pi * tangent**2 / 4.0, rel=0.02)
     assert image[100, 100, 0] > 100 and np.all(image[100, 100, 1:] == 0)
 

@@ -80,9 +80,8 @@ def test_points_are_placed_by_the_pose_of_their_ring_at_their_stamp():
         track.T_map_ring[0, column], track.T_map_ring[1, column], np.array(0.5)
     )
     expected = (T_map_ring @ sensor.mount.T_ring_sensor @ [0.3, 0.0, 0.0, 1.0])[:3]
-    np.testing.assert_allclose(
-        cloud.points, [expected], atol=1e-12
-    )  # the zone without return is left out
+    # The zone without return is left out.
+    np.testing.assert_allclose(cloud.points, [expected], atol=1e-12)
 
 
 def test_a_run_folder_gives_back_what_went_in(result, tmp_path):
@@ -98,9 +97,8 @@ def test_a_run_folder_gives_back_what_went_in(result, tmp_path):
     assert names >= {
         f'{kind}_{ring}.tum' for kind in ('estimate', 'truth') for ring in ROBOT.ring_names
     }
-    json.loads(
-        (folder / 'summary.json').read_text(), parse_constant=pytest.fail
-    )  # strict: no NaN, no Infinity
+    # Strict: no NaN, no Infinity.
+    json.loads((folder / 'summary.json').read_text(), parse_constant=pytest.fail)
     yaml.safe_load((folder / 'configuration.yaml').read_text())
 
 

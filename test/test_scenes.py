@@ -106,9 +106,8 @@ def test_robot_has_free_way_through_the_engine():
     clearance = RayCaster(load_scene('S0')).clearance(corridor())
     assert clearance.min() > robot.radius + 0.03
     before_the_last_rows = corridor()[:, 0] < 1.45
-    assert (
-        clearance[before_the_last_rows].min() > robot.radius + 0.10
-    )  # room to bend by a decimetre
+    # Room to bend by a decimetre.
+    assert clearance[before_the_last_rows].min() > robot.radius + 0.10
 
 
 @pytest.mark.parametrize('name', VARIANTS)
@@ -175,9 +174,8 @@ def test_contact_pieces_follow_the_surface_that_sensors_see():
     caster = RayCaster(scene)
     for hull in scene.hulls:
         points = trimesh.sample.sample_surface(trimesh.convex.convex_hull(hull), 300, seed=0)[0]
-        reachable = points[
-            np.hypot(points[:, 1], points[:, 2]) < 1.46
-        ]  # short of rub strips and ports
+        # Short of rub strips and ports.
+        reachable = points[np.hypot(points[:, 1], points[:, 2]) < 1.46]
         if len(reachable):
             assert caster.clearance(reachable).max() < 0.0067
 
@@ -359,9 +357,8 @@ def test_size_is_accepted_from_5_cm_to_50_m(scale):
 
 
 def test_degenerate_faces_are_counted_and_placed():
-    vertices = np.concatenate(
-        [CUBE.vertices, [[0.5, 0.5, 0.2]]]
-    )  # on an edge: a face without area
+    # On an edge: a face without area.
+    vertices = np.concatenate([CUBE.vertices, [[0.5, 0.5, 0.2]]])
     corner, other = (
         int(np.argmin(np.linalg.norm(vertices - [0.5, 0.5, z], axis=1))) for z in (-0.5, 0.5)
     )

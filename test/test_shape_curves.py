@@ -178,9 +178,8 @@ def test_printed_kappa_points_the_wrong_way():
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 3.0, 0.0]])
     tangents = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     mended = curves.fit_curve(points, tangents, 'quadratic_bezier', projected=True, samples=5)
-    np.testing.assert_allclose(
-        mended[1], [0.75, 0.25, 0.0]
-    )  # (p0 + 2 beta + p1) / 4 with beta = (1, 0)
+    # (p0 + 2 beta + p1) / 4 with beta = (1, 0).
+    np.testing.assert_allclose(mended[1], [0.75, 0.25, 0.0])
     printed = printed_quadratic_bezier(points, tangents, 5)
     np.testing.assert_allclose(printed[1], [-0.25, 0.25, 0.0])
 

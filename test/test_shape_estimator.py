@@ -122,9 +122,8 @@ def test_rest_names_what_is_silent():
 def test_calibration_finds_what_is_wrong_with_the_arm(arm, calibration):
     imu, hall = module_mounts(ROBOT)
     turned = imu @ lie.so3_exp(np.array([m.imu_turn for m in calibration.modules]))
-    assert (
-        lie.rotation_error_deg(turned, arm.R_module_imu).max() < 0.08
-    )  # 0.5 deg before, base poses good to 0.05
+    # 0.5 deg before, base poses good to 0.05.
+    assert lie.rotation_error_deg(turned, arm.R_module_imu).max() < 0.08
     turned = hall @ lie.so3_exp(np.array([m.hall_turn for m in calibration.modules]))
     assert lie.rotation_error_deg(turned, arm.R_module_hall).max() < 0.25
     assert calibration.remanence == pytest.approx(arm.magnet.remanence, rel=2.5e-3)  # 2 % before
@@ -262,9 +261,8 @@ def test_perfect_arm_is_found_exactly(position, strain):
     np.testing.assert_allclose(last.T_map_module[:, :3, 3], truth[:, :3, 3], atol=atol)
     assert lie.rotation_error_deg(last.T_map_module[:, :3, :3], truth[:, :3, :3]).max() < degrees
     tip = arm.backbone(strain, np.array([ROBOT.length])) @ ROBOT.base.T_map_base[:3, :3].T
-    assert (
-        np.linalg.norm(last.curve[-1] - tip) < 2e-3
-    )  # a quarter of the robot lies beyond the last module
+    # A quarter of the robot lies beyond the last module.
+    assert np.linalg.norm(last.curve[-1] - tip) < 2e-3
     assert last.curve_s[-1] == pytest.approx(ROBOT.length, rel=5e-3)
 
 

@@ -72,9 +72,8 @@ def test_trials_that_differ_in_the_map_alone_share_one_bag(done):
 
 def test_an_interrupted_campaign_continues(done, monkeypatch):
     out, trials, before = done
-    monkeypatch.setattr(
-        'continuum_loc.evaluation.replay.replay', None
-    )  # a repeated estimation would fail
+    # A repeated estimation would fail.
+    monkeypatch.setattr('continuum_loc.evaluation.replay.replay', None)
     again = run_campaign(trials[:2], out, jobs=1)
     assert [one.summary['digest'] for one in again] == [
         one.summary['digest'] for one in before[:2]

@@ -85,9 +85,8 @@ def test_rays_meet_a_sphere_within_its_faceting():
     rays = unit_rays(2000)
     along = -rays @ eye
     chord = radius**2 - (eye @ eye - along**2)
-    central = (along > 0.0) & (
-        chord > 0.5 * radius**2
-    )  # short of the limb, where a facet's depth is amplified
+    # Short of the limb, where a facet's depth is amplified.
+    central = (along > 0.0) & (chord > 0.5 * radius**2)
     distance, _, _ = RayCaster(scene_of_mesh(mesh)).cast(np.tile(eye, (2000, 1)), rays)
     expected = along[central] - np.sqrt(chord[central])
     assert central.sum() > 20
@@ -328,9 +327,8 @@ def test_perpendicular_distance_comes_in_millimetres_with_the_stated_noise():
     faintness = 1.0 + IDEAL.threshold / signal
     light = np.hypot(MODEL.sigma(np.array(0.8)), IDEAL.noise_floor) * np.sqrt(faintness)
     deviation = np.hypot(light, 1e-3 / np.sqrt(12))
-    assert np.std(depth) == pytest.approx(
-        deviation, rel=0.03
-    )  # 12,800 readings: 0.6 % at one sigma
+    # 12,800 readings: 0.6 % at one sigma.
+    assert np.std(depth) == pytest.approx(deviation, rel=0.03)
     assert abs(np.mean(depth) - 0.8) < 4.0 * deviation / np.sqrt(depth.size)
 
 

@@ -138,7 +138,8 @@ class Chain:
 
     def _forward(self, intervals: list[Blocks], first: int, damping: float) -> None:
         first = min(first, len(self._eliminated))
-        del self.messages[first + 1 :], self._eliminated[first:]
+        kept = first + 1
+        del self.messages[kept:], self._eliminated[first:]
         for k in range(first, len(intervals)):
             self._eliminate(intervals[k], k, damping)
         newest = self.messages[-1]

@@ -88,6 +88,11 @@ def _inside(window: Window, time: float, n: int):
     return _between(window, window.column(k), window.column(k + 1), P, time, n)
 
 
+def _six(at: int) -> slice:
+    """Rows or columns of one part of a node, of which `at` is the first."""
+    return slice(at, at + 6)
+
+
 def _rows_of(window: Window, n: int) -> np.ndarray:
     """(36, D) selection of two neighbouring nodes' rows."""
     return np.eye(2 * NODE_DIM, window.grid.dim, NODE_DIM * n)
@@ -100,12 +105,9 @@ def _behind(window: Window, history: History, time: float, n: int):
     u = (time - older.column.time) / (newer.column.time - older.column.time)
     P = (1.0 - u) * older.covariance[n] + u * newer.covariance[n]
     body = body_between(older.column, newer.column, time)
-    return (
-        body.T[n : n + 2],
-        body.strain[n : n + 2],
-        body.velocity[n : n + 2],
-        P + _open_bridge(window, older.column, newer.column, time),
-    )
+    nodes = slice(n, n + 2)
+    P = P + _open_bridge(window, older.column, newer.column, time)
+    return body.T[nodes], body.strain[nodes], body.velocity[nodes], P
 
 
 def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n: int):
@@ -120,17 +122,12 @@ def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n
         )
         for rows, part in ((POSE, J_pose), (VELOCITY, J_rate)):
             for block, column in enumerate((POSE, VELOCITY, 2 * m + POSE, 2 * m + VELOCITY)):
-                J[m * i + rows : m * i + rows + 6, m * i + column : m * i + column + 6] = part[
-                    :, 6 * block : 6 * block + 6
-                ]
-        J[m * i + STRAIN : m * i + STRAIN + 6, m * i + STRAIN : m * i + STRAIN + 6] = (
-            1.0 - u
-        ) * np.eye(6)
-        J[
-            m * i + STRAIN : m * i + STRAIN + 6,
-            2 * m + m * i + STRAIN : 2 * m + m * i + STRAIN + 6,
-        ] = u * np.eye(6)
-    strain = (1.0 - u) * a.strain[n : n + 2] + u * b.strain[n : n + 2]
+                J[_six(m * i + rows), _six(m * i + column)] = part[:, _six(6 * block)]
+        at = m * i + STRAIN
+        J[_six(at), _six(at)] = (1.0 - u) * np.eye(6)
+        J[_six(at), _six(2 * m + at)] = u * np.eye(6)
+    nodes = slice(n, n + 2)
+    strain = (1.0 - u) * a.strain[nodes] + u * b.strain[nodes]
     return T, strain, velocity, J @ P @ J.T + _open_bridge(window, a, b, time)
 
 
@@ -154,15 +151,14 @@ def _ahead(window: Window, time: float, n: int):
     k, m = len(window.intervals) - 1, NODE_DIM
     P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
     later = newest.predict(dt)
-    J, Q = np.zeros((2 * m, 2 * m)), np.zeros((2 * m, 2 * m))
+    J, Q = np.eye(2 * m), np.zeros((2 * m, 2 * m))
     growth = np.kron(
         [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.diag(window.priors.velocity_psd)
     )
     for i in range(2):
         twist, at = dt * newest.velocity[n + i], m * i
-        J[at : at + m, at : at + m] = np.eye(m)
-        J[at : at + 6, at : at + 6] = lie.adjoint(lie.exp(-twist))
-        J[at : at + 6, at + VELOCITY : at + VELOCITY + 6] = dt * lie.right_jacobian(twist)
+        J[_six(at), _six(at)] = lie.adjoint(lie.exp(-twist))
+        J[_six(at), _six(at + VELOCITY)] = dt * lie.right_jacobian(twist)
         motion = at + np.concatenate(
             [np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)]
         )
@@ -185,13 +181,13 @@ def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd
     J = np.zeros((m, 2 * m))
     for rows, part in ((POSE, J_pose), (STRAIN, J_rate)):
         for block, column in enumerate((POSE, STRAIN, m + POSE, m + STRAIN)):
-            J[rows : rows + 6, column : column + 6] = part[:, 6 * block : 6 * block + 6]
+            J[_six(rows), _six(column)] = part[:, _six(6 * block)]
     u = offset / ds
     carried = [
         weight * lie.adjoint(lie.inverse(T_s) @ T_node)
         for weight, T_node in zip((1.0 - u, u), T, strict=True)
     ]
-    J[VELOCITY:, VELOCITY:m], J[VELOCITY:, m + VELOCITY :] = carried
+    J[_six(VELOCITY), _six(VELOCITY)], J[_six(VELOCITY), _six(m + VELOCITY)] = carried
     covariance = J @ P @ J.T
     space = np.empty((2, 2))
     gp.bridge(offset, ds, space)

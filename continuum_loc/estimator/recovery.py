@@ -28,15 +28,13 @@ from continuum_loc.robot import RobotDescription
 from numba import njit
 import numpy as np
 
-COARSE_SPACING = (
-    0.04  # [m] of the thinned map that the search scores against; it has to tell decimetres apart
-)
+# [m] of the thinned map that the search scores against; it has to tell decimetres apart.
+COARSE_SPACING = 0.04
 ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
 SEARCH_INTERVALS = 2  # the newest, whose measurements decide between bodies
 GATE_SHRINK = 0.75  # of the gate of association, at each iteration from a guess
-HEALTHY_SHARE = (
-    0.85  # of the median sensor's samples fit, else the body is in doubt and no single sensor
-)
+# Of the median sensor's samples fit, else the body is in doubt and no single sensor.
+HEALTHY_SHARE = 0.85
 AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
 

@@ -121,12 +121,13 @@ def _retract(T, strain, velocity, bias, delta):
     step, moved = np.empty((4, 4)), np.empty((4, 4))
     nodes = T.shape[0]
     for n in range(nodes):
-        lie_kernels.exp(delta[18 * n : 18 * n + 6], step)
+        first = NODE_DIM * n
+        lie_kernels.exp(delta[first:][:6], step)
         lie_kernels.compose(T[n], step, moved)
         T[n] = moved
         for i in range(6):
-            strain[n, i] += delta[18 * n + 6 + i]
-            velocity[n, i] += delta[18 * n + 12 + i]
+            strain[n, i] += delta[first + STRAIN + i]
+            velocity[n, i] += delta[first + VELOCITY + i]
     for b in range(bias.shape[0]):
         for i in range(3):
             bias[b, i] += delta[18 * nodes + 3 * b + i]

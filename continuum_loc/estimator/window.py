@@ -26,9 +26,8 @@ import numpy as np
 
 TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
 DAMPING_LIMIT = 1e4
-COST_SLACK = (
-    1e-3  # relative: associations change between iterations, so costs compare only so well
-)
+# Relative: associations change between iterations, so costs compare only so well.
+COST_SLACK = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -299,9 +299,8 @@ def scene_figure(around: Surroundings, shown: list[Moment], epoch: int) -> go.Fi
         )
         for index, moment in enumerate(shown)
     ]
-    first = (
-        len(shown) // 2
-    )  # the middle shows more than the start, where no points have been gathered yet
+    # The middle shows more than the start, where no points have been gathered yet.
+    first = len(shown) // 2
     figure = go.Figure(data=still + (_moving_traces(shown[first]) if shown else []), frames=frames)
     if shown:
         figure.update_layout(

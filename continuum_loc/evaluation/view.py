@@ -14,9 +14,8 @@ from continuum_loc.measurements import NANOSECONDS
 import numpy as np
 
 POINTS_PER_SPAN = 9
-CLOUD_SPAN = (
-    NANOSECONDS // 2
-)  # a picture shows the ToF points of the half second before its instant
+# A picture shows the ToF points of the half second before its instant.
+CLOUD_SPAN = NANOSECONDS // 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,10 @@ from numba import njit
 import numpy as np
 
 NEIGHBOURS = 20  # of a PCA neighbourhood
-SAME_SIDE = (
-    -0.5
-)  # neighbours whose normals differ by more than 120 deg are the other side of a thin part
-CANDIDATES = (
-    4.0  # random darts per (area / spacing^2): more fill the last gaps, at a price in time
-)
+# Neighbours whose normals differ by more than 120 deg are the other side of a thin part.
+SAME_SIDE = -0.5
+# Random darts per (area / spacing^2): more fill the last gaps, at a price in time.
+CANDIDATES = 4.0
 DENSITY = 0.537  # points per (area / spacing^2) that so many darts leave on a plane
 
 

@@ -38,9 +38,8 @@ FIRST_REACH = 0.75  # voxels that a search looks around at first
 PATIENCE = 4  # visits to a cell before it gets a list, which costs as much as a dozen searches
 CROWDED = -1000  # entry of a cell whose list would be too long
 ROUNDING = 1e-9  # far above the rounding of coordinates counted in voxels (2^20 of them at most)
-COUNTERS = (
-    2  # rows after the cell table: [cells in use, pool rows in use], [lists made, times emptied]
-)
+# Rows after the cell table: [cells in use, pool rows in use], [lists made, times emptied].
+COUNTERS = 2
 
 
 class VoxelArrays(NamedTuple):

@@ -265,7 +265,7 @@ class Intake:
     def _without_prefix(self, measurement: Any) -> Any:
         prefix = self.frame_prefix
         if prefix and getattr(measurement, 'sensor', '').startswith(prefix):
-            return replace(measurement, sensor=measurement.sensor[len(prefix) :])
+            return replace(measurement, sensor=measurement.sensor.removeprefix(prefix))
         return measurement
 
     def _check_content(self, topic: str, measurement: Measurement) -> None:

@@ -63,9 +63,8 @@ def refuse_unknown(node: Node) -> None:
 
     A file or the command line may set it.
     """
-    valid = list(
-        node._parameters
-    )  # rclpy has no public list of what was declared and what was overridden
+    # rclpy has no public list of what was declared and what was overridden.
+    valid = list(node._parameters)
     for name in node._parameter_overrides:
         if name in valid or name in _ROS_NAMES or name.startswith(_ROS_PREFIXES):
             continue

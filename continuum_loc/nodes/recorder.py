@@ -21,9 +21,8 @@ from msg_tools.bag import BagWriter, split_topic
 from msg_tools.topics import topic_spec, TOPICS, TRACKER
 from rclpy.qos import DurabilityPolicy
 
-WATCH_PERIOD = (
-    0.5  # s; trackers are found on the graph, as only the robot description could name them before
-)
+# [s] trackers are found on the graph, as only the robot description could name them before.
+WATCH_PERIOD = 0.5
 POLL = 0.1
 
 

@@ -50,7 +50,7 @@ class EstimatorNodeSettings(Settings):
     """Node `estimator`."""
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
-    map: str = Field(
+    map: str = Field(  # noqa: A003  (a parameter's public name)
         '', description='prior map: npz, PLY, PCD, XYZ, CSV or a mesh; empty for none'
     )
     settings: str = Field(

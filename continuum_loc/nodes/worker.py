@@ -30,9 +30,8 @@ import numpy as np
 OK, WARN, ERROR, STALE = range(4)
 POLL = 0.1  # s; how often an idle worker looks whether it has to stop
 STALE_AFTER = 2.0  # s without data
-PLAUSIBLE_LATENCY = (
-    30.0  # s; older stamps come from a bag played without its clock, and say nothing about latency
-)
+# [s] older stamps come from a bag played without its clock, and say nothing about latency.
+PLAUSIBLE_LATENCY = 30.0
 
 
 class WorkerNode(PackageNode):

@@ -214,8 +214,10 @@ def _forward(strain, lengths):
         lie_kernels.ad(xi, A)
         lie_kernels.right_coefficients(xi, c, dc)
         lie_kernels.polynomial(c, A, J, work)
-        chain[n, :, 3 * n : 3 * n + 3] = lengths[n] * J[:, 3:]
-    return T[PIECES - 1 :: PIECES].copy(), chain[PIECES - 1 :: PIECES].copy()
+        start, end = 3 * n, 3 * (n + 1)
+        chain[n, :, start:end] = lengths[n] * J[:, 3:]
+    first = PIECES - 1
+    return T[first::PIECES].copy(), chain[first::PIECES].copy()
 
 
 @njit(cache=True)

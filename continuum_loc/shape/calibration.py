@@ -298,12 +298,8 @@ class _Problem:
             for m in range(self.modules)
         )
         sigma = np.sqrt(np.diag(covariance)) * self.scale
-        turns = np.concatenate(
-            [
-                sigma[3 * self.modules : 6 * self.modules],
-                sigma[9 * self.modules : 12 * self.modules],
-            ]
-        )
+        _, imu_turns, _, hall_turns = np.split(sigma[: 12 * self.modules], 4)
+        turns = np.concatenate([imu_turns, hall_turns])
         remanence = self.robot.magnet.remanence * (1.0 + moment)
         return Calibration(
             modules=modules,

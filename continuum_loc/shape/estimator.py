@@ -136,9 +136,8 @@ class _Stream:
         """Note a reading. False when it is no newer than the last."""
         if self.stamp is not None and stamp <= self.stamp:
             return False
-        same = (
-            self.reading is not None and reading.tobytes() == self.reading.tobytes()
-        )  # nan equals nan
+        # nan equals nan.
+        same = self.reading is not None and reading.tobytes() == self.reading.tobytes()
         self.repeats = self.repeats + 1 if same else 1
         self.saturated = not (np.abs(reading) < full_scale).all()  # also where an axis is nan
         self.stamp, self.reading = stamp, reading
@@ -150,12 +149,11 @@ class _Module:
     """One module's streams and filter state."""
 
     name: str
-    filter: GravityFilter | EulerFilter
+    attitude: GravityFilter | EulerFilter
     imu: _Stream = field(default_factory=_Stream)
     hall: _Stream = field(default_factory=_Stream)
-    field_base: np.ndarray | None = (
-        None  # total field in the base frame [T], averaged while the module rests
-    )
+    # total field in the base frame [T], averaged while the module rests
+    field_base: np.ndarray | None = None
     averaged: int = 0
     lost: bool = False  # the IMU was silent or frozen: its attitude is stale until it starts again
 
@@ -314,7 +312,7 @@ class ShapeEstimator:
         for m, module in enumerate(self._modules):
             accel = rest.accel[m] - self._accel_offset[m]
             R_map_imu = level(self.T_map_base[:3, :3] @ self._R_module_imu[m], accel)
-            module.filter.start(stamp, R_map_imu, rest.gyro[m], yaw_sigma)
+            module.attitude.start(stamp, R_map_imu, rest.gyro[m], yaw_sigma)
             if np.isfinite(rest.field[m]).all():
                 R_base_hall = self._R_base_module(m, stamp) @ self._R_module_hall[m]
                 module.field_base, module.averaged = (
@@ -349,7 +347,7 @@ class ShapeEstimator:
             if module.imu.repeats > 1:
                 return
             self._resume(module, m, sample.stamp, accel)
-        module.filter.update(sample.stamp, sample.angular_velocity, accel)
+        module.attitude.update(sample.stamp, sample.angular_velocity, accel)
 
     def _resume(self, module: _Module, m: int, stamp: int, accel: np.ndarray) -> None:
         """
@@ -361,14 +359,14 @@ class ShapeEstimator:
         R_map_imu = level(
             self.T_map_base[:3, :3] @ self._prior[m, :3, :3] @ self._R_module_imu[m], accel
         )
-        module.filter.start(stamp, R_map_imu, module.filter.bias, RESUMED_YAW)
+        module.attitude.start(stamp, R_map_imu, module.attitude.bias, RESUMED_YAW)
 
     def _sense(self, module: _Module, sample: FieldSample) -> None:
         """Smooth the field in the base frame, where it stands still as long as the module does."""
         m = self._index[sample.sensor]
         R_base_hall = self._R_base_module(m, sample.stamp) @ self._R_module_hall[m]
         field_base = R_base_hall @ (sample.field - self._hall_offset[m])
-        rate = module.filter.rate
+        rate = module.attitude.rate
         if module.averaged == 0 or rate @ rate > self.settings.still**2:
             module.field_base, module.averaged = field_base, 1
         else:
@@ -378,7 +376,7 @@ class ShapeEstimator:
             module.field_base = module.field_base + gain * (field_base - module.field_base)
 
     def _R_base_module(self, m: int, stamp: int) -> np.ndarray:
-        R_map_imu = self._modules[m].filter.rotation_at(stamp)
+        R_map_imu = self._modules[m].attitude.rotation_at(stamp)
         return self.T_map_base[:3, :3].T @ R_map_imu @ self._R_module_imu[m].T
 
     # Estimates
@@ -452,7 +450,7 @@ class ShapeEstimator:
         mounting = self.calibration.mounting_sigma**2 * np.eye(3)
         return (
             R_base_map
-            @ np.stack([module.filter.covariance for module in self._modules])
+            @ np.stack([module.attitude.covariance for module in self._modules])
             @ R_base_map.T
             + mounting
         )
@@ -548,7 +546,7 @@ class ShapeEstimator:
         )
         curve = self._curve(solution.T_base_module)
         R, p = self.T_map_base[:3, :3], self.T_map_base[:3, 3]
-        yaw = [module.filter.yaw_sigma for module in self._modules]
+        yaw = [module.attitude.yaw_sigma for module in self._modules]
         return ShapeEstimate(
             stamp,
             self.module_names,

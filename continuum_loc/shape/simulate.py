@@ -25,11 +25,12 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
 
 PIECES = 6
+# Curvature by groove diameter [1/m].
 GROOVES = {
     'straight': 0.0,
     '160 mm': 1.0 / 0.080,
     '80 mm': 1.0 / 0.040,
-}  # curvature by groove diameter [1/m]
+}
 
 
 class Imperfections(Settings):
@@ -225,7 +226,8 @@ class Arm:
 
     def T_base_module(self, strain: np.ndarray) -> np.ndarray:
         """(..., M, 4, 4) poses of the modules in the base frame, strain (..., N, 3)."""
-        return self._chain(strain)[..., PIECES - 1 : -1 : PIECES, :, :]
+        first = PIECES - 1
+        return self._chain(strain)[..., first:-1:PIECES, :, :]
 
     def _chain(self, strain: np.ndarray) -> np.ndarray:
         """(..., N, 4, 4) poses of the ends of all arcs."""

@@ -16,10 +16,11 @@ import tempfile
 from continuum_loc.simulator.scene import SceneError
 import numpy as np
 
+# Preprocessing: only if the mesh needs it; or always, by a coarse remeshing that never fails.
 _MODES = (
     'auto',
     'on',
-)  # preprocessing: only if the mesh needs it; or always, by a coarse remeshing that never fails
+)
 _THRESHOLD = {'auto': 0.02, 'on': 0.05}  # concavity, as a share of the mesh's size
 _REMESHING = 100  # cells along the longest edge
 _MODULE = 'continuum_loc.simulator.convex'

@@ -98,9 +98,8 @@ class BladeRow:
         return np.radians(self.first_azimuth_deg) + index * 2.0 * np.pi / self.count
 
     def _span(self) -> tuple[float, float]:
-        root = (
-            float(hub_radius(self.x)) - 0.03
-        )  # embedded, so that the union has no gap under the twisted root
+        # Embedded, so that the union has no gap under the twisted root.
+        root = float(hub_radius(self.x)) - 0.03
         casing = float(casing_radius(self.x))
         return root, casing + (_RUB_STRIP_DEPTH / 3.0 if self.rotating else 0.015)
 
@@ -187,9 +186,8 @@ def _section(chord: float, camber: float, thickness: float) -> tuple[np.ndarray,
         * thickness
         * (0.2969 * np.sqrt(u) - 0.1260 * u - 0.3516 * u**2 + 0.2843 * u**3 - 0.1015 * u**4)
     )
-    half = np.maximum(
-        half, 0.004
-    )  # blunt edges: real ones are rounded, and knife edges break mesh unions
+    # Blunt edges: real ones are rounded, and knife edges break mesh unions.
+    half = np.maximum(half, 0.004)
     middle = 4.0 * camber * u * (1.0 - u)
     axial = np.concatenate([u, u[::-1]]) - 0.5
     return chord * axial, chord * np.concatenate([middle + half, (middle - half)[::-1]])
@@ -210,14 +208,18 @@ def _blade_hulls(sections: np.ndarray, chord_pieces: int = 2, span_pieces: int =
     Twist and camber make the whole blade concave.
     """
     side = sections.shape[1] // 2
-    spans = np.linspace(0, len(sections) - 1, span_pieces + 1).round().astype(int)
-    chords = np.linspace(0, side - 1, chord_pieces + 1).round().astype(int)
-    upper, lower = sections[:, :side], sections[:, : side - 1 : -1]
+    upper, lower = sections[:, :side], sections[:, side:][:, ::-1]
     return tuple(
-        np.concatenate([upper[a : b + 1, c : d + 1], lower[a : b + 1, c : d + 1]]).reshape(-1, 3)
-        for a, b in pairwise(spans)
-        for c, d in pairwise(chords)
+        np.concatenate([upper[span, chord], lower[span, chord]]).reshape(-1, 3)
+        for span in _adjoining(len(sections), span_pieces)
+        for chord in _adjoining(side, chord_pieces)
     )
+
+
+def _adjoining(count: int, pieces: int) -> list[slice]:
+    """Slices of about equal length of `count` rows, each beginning with the last one's end."""
+    ends = np.linspace(0, count - 1, pieces + 1).round().astype(int)
+    return [slice(first, last + 1) for first, last in pairwise(ends)]
 
 
 def _casing() -> Part:
@@ -274,7 +276,8 @@ def _hub_hulls(stations: np.ndarray) -> Hulls:
     """
     azimuths = np.radians(np.linspace(-_CONTACT_AZIMUTH, _CONTACT_AZIMUTH, 51))
     nose = stations[stations <= _NOSE_END + 1e-9]
-    pieces = [nose, *zip(stations[len(nose) - 1 :], stations[len(nose) :], strict=False)]
+    last = len(nose) - 1
+    pieces = [nose, *pairwise(stations[last:])]
 
     def wedge(x: np.ndarray) -> np.ndarray:
         surface = wrap(x[:, None], azimuths, hub_radius(x)[:, None]).reshape(-1, 3)

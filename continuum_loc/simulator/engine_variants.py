@@ -34,9 +34,8 @@ from continuum_loc.simulator.solids import (
 from manifold3d import Manifold
 import numpy as np
 
-_EMBED = (
-    0.004  # objects sink this far into what carries them, so that the union leaves no crack [m]
-)
+# Objects sink this far into what carries them, so that the union leaves no crack [m].
+_EMBED = 0.004
 
 
 @dataclass(frozen=True)

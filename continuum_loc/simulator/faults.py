@@ -230,9 +230,8 @@ def miscalibrated(
     sigma = np.repeat([position_sigma, np.radians(rotation_sigma_deg)], 3)
 
     def moved(sensor: Sensor) -> Sensor:
-        error = sigma * rng.standard_normal(
-            6
-        )  # drawn for every sensor, so that the choice does not shift the rest
+        # Drawn for every sensor, so that the choice does not shift the rest.
+        error = sigma * rng.standard_normal(6)
         if not any(fnmatchcase(sensor.name, pattern) for pattern in sensors):
             return sensor
         return sensor.model_copy(

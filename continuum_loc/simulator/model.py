@@ -28,17 +28,17 @@ ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one 
 NODE_PREFIX = 'node'
 REST_SPEED = 1e-4
 SETTLE_LIMIT = 60.0  # s of simulated time
-SETTLE_DAMPING = (
-    8.0  # damping while settling, relative to the plant's: near critical for the first mode
-)
+# Damping while settling, relative to the plant's: near critical for the first mode.
+SETTLE_DAMPING = 8.0
 QUIET_STEPS = 20
+# Near-hard: MuJoCo's default friction creeps, and forgets a hysteresis.
 STICTION = (
     0.999,
     0.999,
     0.001,
     0.5,
     2.0,
-)  # near-hard: MuJoCo's default friction creeps, and forgets a hysteresis
+)
 DIVERGED_SPEED = 1e3  # rad/s or m/s
 GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
 
@@ -69,9 +69,8 @@ def build_spec(
     spec.option.gravity = (0.0, 0.0, 0.0 if supported else -GRAVITY)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.solver = mujoco.mjtSolver.mjSOL_CG
-    spec.option.disableflags |= (
-        mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    )  # divergence is ours to report
+    # Divergence is ours to report.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.compiler.autolimits = True
     nodes = node_arclengths(robot, plant, chosen.link_length)
     _check_step(plant, nodes, chosen.time_step)
@@ -184,9 +183,8 @@ def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> No
 
 def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndarray) -> None:
     parent, joint_frame = _add_base(spec, robot, plant)
-    half = np.concatenate(
-        [[0.0], np.diff(nodes) / 2.0, [0.0]]
-    )  # half[i], half[i + 1]: reach of node i back, forth
+    # half[i], half[i + 1]: reach of node i back, forth.
+    half = np.concatenate([[0.0], np.diff(nodes) / 2.0, [0.0]])
     for i in range(len(nodes)):
         body = parent.add_body(name=f'{NODE_PREFIX}{i}', pos=joint_frame)
         if i > 0:
@@ -295,9 +293,8 @@ def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
     import mujoco
 
     names = iter(plant.tendon_names)
-    reach = (
-        (1.0 - GUIDE) / 2.0 * np.diff(nodes)
-    )  # from a node to the channel's mouth, in each segment
+    # From a node to the channel's mouth, in each segment.
+    reach = (1.0 - GUIDE) / 2.0 * np.diff(nodes)
     openings = [mouth for i, x in enumerate(reach) for mouth in ((i, x), (i + 1, -x))]
     for group in plant.tendons:
         last = int(np.argmin(np.abs(nodes - group.end)))

@@ -30,15 +30,17 @@ PAINT = {
     'cracker_box': (0.78, 0.20, 0.18),
     'wet_floor_sign': (0.97, 0.88, 0.20),
 }
+# Shadows of what is near only: inside, all is in the dark.
 AMBIENT, SHADOW, SHADOW_LENGTH = (
     0.45,
     0.55,
     0.3,
-)  # shadows of what is near only: inside, all is in the dark
+)
+# Rays per sample for `draw`; what is farther than this hides no sky [m].
 DAYLIGHT, DAYLIGHT_REACH = (
     8,
     0.15,
-)  # rays per sample for `draw`; what is farther than this hides no sky [m]
+)
 SUPERSAMPLE = 2
 SIDES = 48
 

@@ -17,11 +17,10 @@ from continuum_loc.robot import TofModel
 from continuum_loc.simulator.raycast import cast_capsules, RayCaster
 import numpy as np
 
-TOF_TOO_CLOSE = 4  # the driver reports a consistency failure there
-
 if TYPE_CHECKING:
     from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
 
+TOF_TOO_CLOSE = 4  # the driver reports a consistency failure there
 Fidelity = Literal['paper', 'vl53l5cx']
 
 # The body's black plastic, and the mean cosine at which rays meet a cylinder seen broadside.
@@ -147,9 +146,8 @@ class PaperReceiver:
     def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings:
         """Turn echoes (S, Z) into readings (S, Z)."""
         model, raw = self._model, echoes.distance * self._raw_per_range
-        noise = rng.standard_normal(
-            raw.shape
-        )  # for every zone, hit or not: the stream stays aligned
+        # For every zone, hit or not: the stream stays aligned.
+        noise = rng.standard_normal(raw.shape)
         hit = raw <= model.max_range
         measured = np.where(hit, raw, 0.0) + noise * model.sigma(np.where(hit, raw, 0.0))
         too_close = hit & (measured < model.min_range)

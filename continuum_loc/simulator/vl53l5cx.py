@@ -206,10 +206,13 @@ def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndar
     rows, columns = signal.shape[1:]
     margin = ((0, 0), (1, 1), (1, 1))
     padded = np.pad(signal, margin), np.pad(depth, margin)
-    shifts = [(r, c) for r in range(3) for c in range(3) if (r, c) != (1, 1)]
-    around = [
-        np.stack([grid[:, r : r + rows, c : c + columns] for r, c in shifts]) for grid in padded
+    shifts = [
+        (slice(r, r + rows), slice(c, c + columns))
+        for r in range(3)
+        for c in range(3)
+        if (r, c) != (1, 1)
     ]
+    around = [np.stack([grid[:, down, across] for down, across in shifts]) for grid in padded]
     brightest = np.argmax(around[0], axis=0)[None]
     return tuple(np.take_along_axis(grid, brightest, axis=0)[0] for grid in around)
 

@@ -239,9 +239,8 @@ class _Body:
             [i for i in range(model.nbody) if model.body(i).name.startswith(NODE_PREFIX)]
         )
         self._slides = robot.base.insertion.mode != 'fixed'
-        self._lead = (
-            carriage_damping(plant) / plant.carriage_stiffness
-        )  # s: cancels the drag of the drive's damping
+        # [s], cancels the drag of the drive's damping.
+        self._lead = carriage_damping(plant) / plant.carriage_stiffness
         mujoco.mj_forward(model, self.data)
         self.straight_length = self.data.ten_length.copy()
         self._steps = 0

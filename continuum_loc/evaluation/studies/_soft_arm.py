@@ -18,9 +18,8 @@ TRAJECTORIES = {
     'R4': ('b1', 'b2', 'b3', 'b4'),
 }
 MATCHING = tuple((f'R{k}', f'R{k}') for k in range(5))
-ADDED = tuple(
-    (f'R{k}', f'R{k + 1}') for k in range(4)
-)  # (map, scene): the scene has one more object
+# (map, scene): the scene has one more object.
+ADDED = tuple((f'R{k}', f'R{k + 1}') for k in range(4))
 REMOVED = tuple((f'R{k + 1}', f'R{k}') for k in range(4))
 # `paper`: one ray per zone. `vl53l5cx`: the sensor as it is, with mounting errors, clock offset
 # and gyro bias.

@@ -43,9 +43,8 @@ import numpy as np
 
 THRESHOLDS = np.round(np.arange(0.0, 1.0, 0.05), 2)
 LEAST_SIZE = 0.03  # m: smaller anomalies are not asked for
-APART = (
-    10_000 * NANOSECONDS
-)  # trials of one scene all begin at the same stamp: keep their instants apart
+# Trials of one scene all begin at the same stamp: keep their instants apart.
+APART = 10_000 * NANOSECONDS
 
 
 @dataclass(frozen=True, eq=False)
