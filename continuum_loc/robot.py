@@ -129,6 +129,16 @@ class Backbone(Settings):
 
     rest_strain: Vector6 = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     rest_strain_sigma: Vector6 = (0.002, 0.002, 0.002, 0.02, 4.0, 4.0)
+    module_ends: tuple[float, ...] = Field(
+        (), description='arclengths at which a module ends, so that strain may step there [m]'
+    )
+
+    @field_validator('module_ends')
+    @classmethod
+    def _in_order(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if any(s <= 0.0 for s in value) or list(value) != sorted(set(value)):
+            raise ValueError('must increase from above 0; the ends of the body are no module ends')
+        return value
 
     @field_validator('rest_strain_sigma')
     @classmethod

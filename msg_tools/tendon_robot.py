@@ -10,6 +10,9 @@ arclength (m), data...`:
 - gyro_*: angular velocity in the body frame, rad/s;
 - vicon*: poses by motion capture, of the same form: the truth.
 
+Tracked poses that a logger only held are dropped, and the stamps of the others are evened out
+(`measured_anew`).
+
 Their body frame has the backbone's tangent along z, ours along x. The axes are renamed, x y z <- z
 x y, by a constant rotation on the right of every pose (T_map_body <- T_map_body T_THEIRS_OURS) and
 its inverse on the left of every angular velocity; the map's axes stay theirs. A sensor is told by
@@ -18,7 +21,7 @@ its arclength, which the robot description names.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from continuum_loc import lie
@@ -31,12 +34,16 @@ from continuum_loc.measurements import (
 )
 from continuum_loc.robot import RobotDescription, Sensor
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 # Some recordings begin a little before their time zero, and stamps in ROS are not negative.
 STAMP_OF_ZERO = nanoseconds(10.0)
 R_THEIRS_OURS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 T_THEIRS_OURS = np.block([[R_THEIRS_OURS, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
 ARCLENGTH_TOLERANCE = 1e-3  # [m]
+EVENED_OVER = (
+    16  # samples: several rounds of a logging grid's pattern, short against a clock's drift
+)
 VALUES = {'aurora': 6, 'vicon': 6, 'gyro': 3}
 
 
@@ -98,11 +105,13 @@ class _File:
     values: np.ndarray
 
 
-def read_recording(folder: str | Path, robot: RobotDescription) -> Recording:
+def read_recording(
+    folder: str | Path, robot: RobotDescription, as_logged: bool = False
+) -> Recording:
     """
     Read a trial's folder, for the robot whose description says which sensor sits where.
 
-    Raises TrialError.
+    as_logged: keep held poses and the logger's own stamps. Raises TrialError.
     """
     folder = Path(folder)
     paths = sorted(folder.glob('*.csv'))
@@ -114,6 +123,8 @@ def read_recording(folder: str | Path, robot: RobotDescription) -> Recording:
         if file.kind == 'vicon':
             truth[_ring_name(file, robot)] = (file.stamps, lie.exp(file.values) @ T_THEIRS_OURS)
         else:
+            if file.kind == 'aurora' and not as_logged:
+                file = replace(file, **measured_anew(file.stamps, file.values))
             measurements += _tracked(file, robot) if file.kind == 'aurora' else _rates(file, robot)
     measurements.sort(key=lambda sample: (sample.stamp, sample.sensor))
     return Recording(measurements, truth)
@@ -149,6 +160,26 @@ def _tracked(file: _File, robot: RobotDescription) -> list[Measurement]:
         TrackedPose(int(stamp), sensor.name, T)
         for stamp, T in zip(file.stamps, poses, strict=True)
     ]
+
+
+def measured_anew(stamps: np.ndarray, values: np.ndarray) -> dict[str, np.ndarray]:
+    """
+    Drop rows that only repeat the one before, and space the stamps of the others evenly.
+
+    A logger that runs faster than its device holds the last sample: the tracker's 40 Hz on a grid
+    of 50 Hz repeat every fifth row, and each stamp is late by up to a step of the grid, which at
+    1 m/s is 2 cm. The stamps become multiples of the device's period about their own running
+    mean. Rows (K,) and (K, D); without a repeat they stay as they are.
+    """
+    fresh = np.append(True, np.any(np.diff(values, axis=0) != 0.0, axis=1))
+    kept, span = stamps[fresh], EVENED_OVER
+    if np.all(fresh) or len(kept) <= span:
+        return {'stamps': kept, 'values': values[fresh]}
+    period = np.median(kept[span:] - kept[:-span]) / span
+    number = np.append(0, np.cumsum(np.maximum(1, np.floor(np.diff(kept) / period + 0.35))))
+    late = uniform_filter1d(kept - number * period - kept[0], span, mode='nearest')
+    evened = kept[0] + np.round(number * period + late).astype(np.int64)
+    return {'stamps': evened, 'values': values[fresh]}
 
 
 def _rates(file: _File, robot: RobotDescription) -> list[Measurement]:

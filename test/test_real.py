@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from msg_tools.bag import read_bag
 from msg_tools.tendon_robot import (
     import_trial,
+    measured_anew,
     R_THEIRS_OURS,
     read_recording,
     STAMP_OF_ZERO,
@@ -170,7 +171,8 @@ def test_hermite_curves_give_the_published_figures():
     from continuum_loc.evaluation.studies.real import data_folder, HERMITE, hermite_errors, WINDOWS
 
     for name, window in WINDOWS.items():
-        found = hermite_errors(read_recording(data_folder() / name, ROBOT), ROBOT, window)
+        logged = read_recording(data_folder() / name, ROBOT, as_logged=True)
+        found = hermite_errors(logged, ROBOT, window)
         rmse = [1e3 * np.sqrt(np.mean(error**2)) for error in found.values()]
         np.testing.assert_allclose(rmse, HERMITE[name], atol=0.051)
 
@@ -191,3 +193,23 @@ def test_the_smoothed_filter_beats_hermite_and_the_published_filter_inside_the_b
     ]
     assert len(inner) == 6
     assert all(claim.holds for claim in inner), [claim for claim in inner if not claim.holds]
+
+
+def test_held_rows_are_dropped_and_stamps_evened_out():
+    """Of 40 Hz logged on a 50 Hz grid, each sample stays once, its stamp as late as all others are."""
+    grid = np.round(0.02 * np.arange(500) * 1e9).astype(np.int64)
+    sample = np.floor(grid * 1e-9 / 0.025 + 1e-6).astype(int)
+    values = np.random.default_rng(1).normal(size=(sample[-1] + 1, 6))
+    stamps, fresh = measured_anew(grid, values[sample]).values()
+    np.testing.assert_array_equal(fresh, values)
+    late = stamps * 1e-9 - 0.025 * np.arange(len(values))
+    assert np.ptp(late[8:-8]) < 1e-3  # the grid's own stamps differ by 15 ms
+    assert 0.0 <= late.mean() <= 0.02
+
+
+def test_a_log_without_held_rows_keeps_its_stamps():
+    grid = np.cumsum(np.random.default_rng(2).integers(15_000_000, 25_000_000, 100))
+    values = np.random.default_rng(3).normal(size=(100, 6))
+    stamps, fresh = measured_anew(grid, values).values()
+    np.testing.assert_array_equal(stamps, grid)
+    np.testing.assert_array_equal(fresh, values)

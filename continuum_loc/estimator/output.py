@@ -121,10 +121,10 @@ def motion_jacobians(
 
 
 def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -> np.ndarray:
-    """(12, 12) covariance of [pose, velocity] at `time` that the two columns' ends leave open."""
+    """Covariance (m, 12, 12) of [pose, velocity] at `time` that the two columns' ends leave open; velocity_psd (m, 6)."""
     open_bridge = np.empty((2, 2))
     gp.bridge(time - a.time, b.time - a.time, open_bridge)
-    return np.kron(open_bridge, np.diag(velocity_psd))
+    return np.kron(open_bridge, velocity_psd[:, :, None] * np.eye(6))
 
 
 @njit(cache=True)

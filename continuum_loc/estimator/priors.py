@@ -25,7 +25,11 @@ MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in mo
 
 
 class Priors:
-    """The prior of a robot with given settings, on a grid."""
+    """
+    The prior of a robot with given settings, on a grid.
+
+    velocity_psd (N, 6) by node and strain_psd (N - 1, 6) by segment: the process noise.
+    """
 
     def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
         prior = settings.prior
@@ -34,10 +38,15 @@ class Priors:
         self.s = grid.s
         self.rest = np.array(robot.backbone.rest_strain)
         self.rest_information = 1.0 / np.square(robot.backbone.rest_strain_sigma)
-        self.velocity_psd = np.array(prior.velocity)
+        grown = (
+            prior.velocity_at_base + (1.0 - prior.velocity_at_base) * (grid.s / grid.s[-1]) ** 2
+        )
+        self.velocity_psd = grown[:, None] * np.array(prior.velocity)
         self.velocity = 1.0 / self.velocity_psd
         self.strain_rate = 1.0 / np.array(prior.strain_rate)
-        self.strain = 1.0 / np.array(prior.strain)
+        step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
+        self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
+        self.strain = 1.0 / self.strain_psd
         self.velocity_slope = 1.0 / np.array(prior.velocity_slope)
         self.bias_rate = 1.0 / settings.gyro.bias_walk**2
         self.bias_information = 1.0 / settings.gyro.bias_sigma**2
@@ -150,7 +159,7 @@ def _add_time(
     for n in range(T_a.shape[0]):
         gp.motion_error(T_a[n], v_a[n], T_b[n], v_b[n], dt, e, J, W, V, M)
         gp.time_index(n, VELOCITY, size, index)
-        squared += gp.add_motion(H, g, index, e, J, dt, velocity_information)
+        squared += gp.add_motion(H, g, index, e, J, dt, velocity_information[n])
         for i in range(6):
             older = NODE_DIM * n + STRAIN + i
             newer = older + size
@@ -186,7 +195,7 @@ def _add_space(
         ds = s[n + 1] - s[n]
         gp.motion_error(T[n], strain[n], T[n + 1], strain[n + 1], ds, e, J, W, V, M)
         _segment_index(n, STRAIN, index)
-        squared += gp.add_motion(H, g, index, e, J, ds, strain_information)
+        squared += gp.add_motion(H, g, index, e, J, ds, strain_information[n])
         gp.transport_error(T[n], velocity[n], T[n + 1], velocity[n + 1], e[:6], J[:6], W, V, M)
         _segment_index(n, VELOCITY, index)
         for i in range(6):

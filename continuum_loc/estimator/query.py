@@ -78,7 +78,7 @@ def state_at(window: Window, history: History, time: float, s: float) -> BodySta
         T, strain, velocity, P = _inside(window, time, n)
     else:
         T, strain, velocity, P = _behind(window, history, time, n)
-    return _along(window.grid, n, offset, T, strain, velocity, P, 1.0 / window.priors.strain)
+    return _along(window.grid, n, offset, T, strain, velocity, P, window.priors.strain_psd[n])
 
 
 def _inside(window: Window, time: float, n: int):
@@ -106,7 +106,7 @@ def _behind(window: Window, history: History, time: float, n: int):
     P = (1.0 - u) * older.covariance[n] + u * newer.covariance[n]
     body = body_between(older.column, newer.column, time)
     nodes = slice(n, n + 2)
-    P = P + _open_bridge(window, older.column, newer.column, time)
+    P = P + _open_bridge(window, older.column, newer.column, time, n)
     return body.T[nodes], body.strain[nodes], body.velocity[nodes], P
 
 
@@ -128,21 +128,27 @@ def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n
         J[_six(at), _six(2 * m + at)] = u * np.eye(6)
     nodes = slice(n, n + 2)
     strain = (1.0 - u) * a.strain[nodes] + u * b.strain[nodes]
-    return T, strain, velocity, J @ P @ J.T + _open_bridge(window, a, b, time)
+    return T, strain, velocity, J @ P @ J.T + _open_bridge(window, a, b, time, n)
 
 
-def _open_bridge(window: Window, a: Column, b: Column, time: float) -> np.ndarray:
-    """(36, 36) what two columns leave open about the two nodes between them."""
+def _open_bridge(window: Window, a: Column, b: Column, time: float, n: int) -> np.ndarray:
+    """What two columns leave open about the two nodes between them, (36, 36)."""
     d, tau = b.time - a.time, time - a.time
     motion = np.empty((2, 2))
     gp.bridge(tau, d, motion)
-    node = np.zeros((NODE_DIM, NODE_DIM))
-    both = np.kron(motion, np.diag(window.priors.velocity_psd))
-    at = np.concatenate([np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)])
-    node[np.ix_(at, at)] = both
-    strain = np.arange(STRAIN, STRAIN + 6)
-    node[strain, strain] = tau * (d - tau) / d / window.priors.strain_rate
-    return np.kron(np.eye(2), node)
+    return _process_noise(window, n, motion, tau * (d - tau) / d)
+
+
+def _process_noise(window: Window, n: int, motion: np.ndarray, strain: float) -> np.ndarray:
+    """Covariance (36, 36) of nodes n and n + 1: `motion` (2, 2) and `strain` times the priors' densities."""
+    Q = np.zeros((2 * NODE_DIM, 2 * NODE_DIM))
+    for i in range(2):
+        start = NODE_DIM * i
+        at = start + np.concatenate([np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)])
+        Q[np.ix_(at, at)] = np.kron(motion, np.diag(window.priors.velocity_psd[n + i]))
+        at = start + np.arange(STRAIN, STRAIN + 6)
+        Q[at, at] = strain / window.priors.strain_rate
+    return Q
 
 
 def _ahead(window: Window, time: float, n: int):
@@ -151,22 +157,15 @@ def _ahead(window: Window, time: float, n: int):
     k, m = len(window.intervals) - 1, NODE_DIM
     P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
     later = newest.predict(dt)
-    J, Q = np.eye(2 * m), np.zeros((2 * m, 2 * m))
-    growth = np.kron(
-        [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.diag(window.priors.velocity_psd)
-    )
+    J = np.eye(2 * m)
     for i in range(2):
         twist, at = dt * newest.velocity[n + i], m * i
         J[_six(at), _six(at)] = lie.adjoint(lie.exp(-twist))
         J[_six(at), _six(at + VELOCITY)] = dt * lie.right_jacobian(twist)
-        motion = at + np.concatenate(
-            [np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)]
-        )
-        Q[np.ix_(motion, motion)] += growth
-        strain = at + np.arange(STRAIN, STRAIN + 6)
-        Q[strain, strain] += dt / window.priors.strain_rate
+    growth = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+    covariance = J @ P @ J.T + _process_noise(window, n, growth, dt)
     nodes = slice(n, n + 2)
-    return later.T[nodes], later.strain[nodes], later.velocity[nodes], J @ P @ J.T + Q
+    return later.T[nodes], later.strain[nodes], later.velocity[nodes], covariance
 
 
 def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd) -> BodyState:

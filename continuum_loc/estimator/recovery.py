@@ -308,7 +308,7 @@ class ShapeSearch:
         self.curvatures = self.curvatures[
             np.hypot(*self.curvatures.T) <= settings.max_curvature + 1e-9
         ]
-        self._bending_psd = float(np.mean(1.0 / priors.strain[4:]))
+        self._bending_psd = float(np.mean(priors.strain_psd[~grid.steps, 4:]))
 
     @property
     def _map(self) -> tuple:

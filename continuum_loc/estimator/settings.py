@@ -30,9 +30,19 @@ class PriorSettings(Settings):
         (1e-4, 1e-4, 1e-4, 1e-2, 4.0, 4.0),
         description='random walk of the strain, in time [1/s, 1/(m^2 s)]',
     )
+    velocity_at_base: float = Field(
+        1.0,
+        gt=0.0,
+        le=1.0,
+        description='share of that noise at the base; it grows with the square of the arclength',
+    )
     strain: Vector6 = Field(
         (1e-5, 1e-5, 1e-5, 1e-3, 15.0, 15.0),
         description="white noise on the strain's slope, in arclength [1/m, 1/m^3]",
+    )
+    strain_step: Vector6 = Field(
+        (0.0, 0.0, 0.0, 0.0, 5.0, 5.0),
+        description='spread of the step at a module end of the robot description [1, 1/m]',
     )
     velocity_slope: Vector6 = Field(
         (0.01, 0.01, 0.01, 1.0, 1.0, 1.0),

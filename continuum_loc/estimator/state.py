@@ -16,22 +16,28 @@ from numba import njit
 import numpy as np
 
 NODE_DIM = 18
+STEP_LENGTH = 0.004  # [m] over which strain may step at a module's end
 POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
 
 
 class Grid:
     """
-    Where the nodes are: at the base, at every ring and the tip, and in between.
+    Where the nodes are: at the base, every ring and the tip, at module ends, and in between.
 
-    In between, no farther apart than `spacing`.
+    At a module end there are two, before and behind the step of its strain; in between, nodes are
+    no farther apart than `spacing`.
 
-    s: (N,) arclengths [m]; ring_nodes: (R + 1,) nodes of the base and of the rings; biases: number
-    of IMUs;
-    dim: length of a column's tangent vector.
+    s: (N,) arclengths [m]; steps: (N - 1,) whether strain may step in a segment; ring_nodes:
+    (R + 1,) nodes of the base and of the rings; biases: number of IMUs; dim: length of a column's
+    tangent vector.
     """
 
     def __init__(self, robot: RobotDescription, spacing: float):
-        anchors = np.unique(np.concatenate([[0.0], robot.ring_arclengths, [robot.length]]))
+        before = np.array(robot.backbone.module_ends)
+        behind = before + STEP_LENGTH
+        anchors = np.unique(
+            np.concatenate([[0.0], robot.ring_arclengths, before, behind, [robot.length]])
+        )
         if anchors[-1] - anchors[-2] < 1e-6:
             anchors = np.delete(anchors, -2 if len(anchors) > 2 else -1)
         pieces = [
@@ -39,6 +45,7 @@ class Grid:
             for a, b in zip(anchors[:-1], anchors[1:], strict=True)
         ]
         self.s = np.concatenate([*pieces, anchors[-1:]])
+        self.steps = np.isin(self.s[1:], behind)
         self.ring_nodes = np.array([self.node_at(s) for s in (0.0, *robot.ring_arclengths)])
         self.nodes = len(self.s)
         self.biases = len(robot.imu)

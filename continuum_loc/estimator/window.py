@@ -299,4 +299,4 @@ class Window:
         a, b = self.column(k), self.column(k + 1)
         P = self.chain.covariance(k, *motion_jacobians(a, b, time, nodes, self.grid.dim))
         own = P.reshape(m, 12, m, 12)[np.arange(m), :, np.arange(m)]
-        return own + motion_bridge(a, b, time, self.priors.velocity_psd)
+        return own + motion_bridge(a, b, time, self.priors.velocity_psd[nodes])
