@@ -196,7 +196,7 @@ def test_the_smoothed_filter_beats_hermite_and_the_published_filter_inside_the_b
 
 
 def test_held_rows_are_dropped_and_stamps_evened_out():
-    """Of 40 Hz logged on a 50 Hz grid, each sample stays once, its stamp as late as all others are."""
+    """Of 40 Hz logged on a 50 Hz grid each sample stays once, as late as all others."""
     grid = np.round(0.02 * np.arange(500) * 1e9).astype(np.int64)
     sample = np.floor(grid * 1e-9 / 0.025 + 1e-6).astype(int)
     values = np.random.default_rng(1).normal(size=(sample[-1] + 1, 6))

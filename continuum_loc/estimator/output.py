@@ -121,7 +121,11 @@ def motion_jacobians(
 
 
 def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -> np.ndarray:
-    """Covariance (m, 12, 12) of [pose, velocity] at `time` that the two columns' ends leave open; velocity_psd (m, 6)."""
+    """
+    Covariance (m, 12, 12) of [pose, velocity] at `time` that the two columns leave open.
+
+    velocity_psd: (m, 6) process noise of the nodes.
+    """
     open_bridge = np.empty((2, 2))
     gp.bridge(time - a.time, b.time - a.time, open_bridge)
     return np.kron(open_bridge, velocity_psd[:, :, None] * np.eye(6))

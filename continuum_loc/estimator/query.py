@@ -132,7 +132,7 @@ def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n
 
 
 def _open_bridge(window: Window, a: Column, b: Column, time: float, n: int) -> np.ndarray:
-    """What two columns leave open about the two nodes between them, (36, 36)."""
+    """Covariance (36, 36) that two columns leave open of the two nodes between them."""
     d, tau = b.time - a.time, time - a.time
     motion = np.empty((2, 2))
     gp.bridge(tau, d, motion)
@@ -140,7 +140,7 @@ def _open_bridge(window: Window, a: Column, b: Column, time: float, n: int) -> n
 
 
 def _process_noise(window: Window, n: int, motion: np.ndarray, strain: float) -> np.ndarray:
-    """Covariance (36, 36) of nodes n and n + 1: `motion` (2, 2) and `strain` times the priors' densities."""
+    """Covariance (36, 36) of nodes n and n + 1: `motion` (2, 2) and `strain` times the noise."""
     Q = np.zeros((2 * NODE_DIM, 2 * NODE_DIM))
     for i in range(2):
         start = NODE_DIM * i
