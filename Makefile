@@ -6,6 +6,13 @@ PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
 RUN := $(VENV)/bin
+SOURCES := setup.py continuum_loc msg_tools test bench launch
+
+# A linter of ROS where it is installed: the command $(1); elsewhere a line that says so, with $(2).
+define ament
+@if command -v $(firstword $(1)) >/dev/null; then $(1); \
+	else echo "$(firstword $(1)) is not installed (it comes with ROS): $(2)"; fi
+endef
 
 install: $(VENV)/installed
 
@@ -27,8 +34,10 @@ test: install
 
 lint: install
 	$(RUN)/ruff check .
-	@if command -v ament_xmllint >/dev/null; then ament_xmllint package.xml; \
-		else echo "ament_xmllint is not installed (it comes with ROS): package.xml is checked by the tests alone"; fi
+	$(RUN)/ruff format --check .
+	$(call ament,ament_flake8 $(SOURCES),its rules are checked by ruff and the tests alone)
+	$(call ament,ament_pep257 $(SOURCES),its rules are checked by ruff alone)
+	$(call ament,ament_xmllint package.xml,package.xml is checked by the tests alone)
 
 bench: install
 	$(RUN)/continuum-loc bench

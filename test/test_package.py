@@ -1,12 +1,14 @@
 """The package as such: light and free of ROS at its core, and what colcon and pip need of it."""
 
 import ast
+import io
 import os
 from pathlib import Path
 import re
 import shutil
 import subprocess
 import sys
+import tokenize
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -136,6 +138,33 @@ def test_every_node_has_its_executable_where_ros2_run_looks():
         assert os.access(path, os.X_OK) and path.read_text().startswith('#!/bin/sh')
         assert (ROOT / 'continuum_loc' / 'nodes' / f'{node}.py').is_file()
         assert (ROOT / 'config' / f'{node}.yaml').is_file()
+
+
+@pytest.mark.parametrize('command', ['check', 'format --check'])
+def test_the_style_is_that_of_ros(command):
+    """Rules of ament_flake8 and ament_pep257, as pyproject.toml has them."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'ruff', *command.split(), '.'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_no_slice_has_a_space_before_its_colon():
+    """E203 of ament_flake8, which ruff's formatter breaks: give bounds that need one a name."""
+    spaced = []
+    for folder in ('continuum_loc', 'msg_tools', 'test', 'bench', 'launch'):
+        for path in (ROOT / folder).rglob('*.py'):
+            text = path.read_text()
+            if not re.search('[^ ,] +:', text):
+                continue
+            for token in tokenize.generate_tokens(io.StringIO(text).readline):
+                before = token.line[: token.start[1]]
+                if token.string == ':' and re.search('[^ ,] +$', before):
+                    spaced.append(f'{path.relative_to(ROOT)}:{token.start[0]}')
+    assert not spaced
 
 
 def test_requirements_are_pinned_and_name_no_index():
