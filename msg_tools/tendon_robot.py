@@ -41,9 +41,8 @@ STAMP_OF_ZERO = nanoseconds(10.0)
 R_THEIRS_OURS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 T_THEIRS_OURS = np.block([[R_THEIRS_OURS, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
 ARCLENGTH_TOLERANCE = 1e-3  # [m]
-EVENED_OVER = (
-    16  # samples: several rounds of a logging grid's pattern, short against a clock's drift
-)
+# Samples: several rounds of a logging grid's pattern, short against a clock's drift.
+EVENED_OVER = 16
 VALUES = {'aurora': 6, 'vicon': 6, 'gyro': 3}
 
 

@@ -190,19 +190,9 @@ def test_a_wheel_holds_everything_that_runs(tmp_path):
         if (ROOT / name).is_file() and not name.startswith('test/'):
             (tmp_path / 'src' / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, tmp_path / 'src' / name)
+    build = 'pip wheel --quiet --no-deps --no-build-isolation --wheel-dir'.split()
     done = subprocess.run(
-        [
-            sys.executable,
-            '-m',
-            'pip',
-            'wheel',
-            '--quiet',
-            '--no-deps',
-            '--no-build-isolation',
-            '--wheel-dir',
-            str(tmp_path),
-            str(tmp_path / 'src'),
-        ],
+        [sys.executable, '-m', *build, str(tmp_path), str(tmp_path / 'src')],
         capture_output=True,
         text=True,
     )

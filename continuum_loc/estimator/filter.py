@@ -212,9 +212,8 @@ class SlidingWindowFilter:
         if not self.window.intervals:
             return None
         started = clock.perf_counter()
-        with self._threads.limit(
-            limits=1, user_api='blas'
-        ):  # small matrices: more threads only wait for one another
+        with self._threads.limit(limits=1, user_api='blas'):
+            # Small matrices: more threads only wait for one another.
             iterations, converged = self._solve()
             return self._estimate(iterations, converged, started)
 

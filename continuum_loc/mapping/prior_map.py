@@ -196,9 +196,8 @@ def _read_text(path: Path, spacing, viewpoint, seed) -> PriorMap:
     if comma:
         skipped = _check_csv_header(path)
     try:
-        with warnings.catch_warnings(
-            action='ignore', category=UserWarning
-        ):  # of an empty file, which is refused below
+        with warnings.catch_warnings(action='ignore', category=UserWarning):
+            # Of an empty file, which is refused below.
             table = np.loadtxt(
                 path, delimiter=',' if comma else None, skiprows=skipped, ndmin=2, comments='#'
             )

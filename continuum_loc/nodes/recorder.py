@@ -74,9 +74,8 @@ class RecorderNode(PackageNode):
     def _subscribe(self, topic: str) -> None:
         spec = topic_spec(topic)
         qos = input_qos(spec, self.settings.reliable_inputs)
-        if (
-            spec.latched
-        ):  # a latched message of before our start is only given to those who ask for it
+        if spec.latched:
+            # A latched message of before our start is only given to those who ask for it.
             qos = input_qos(spec, True)
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
         self.listen(spec.type, topic, partial(self._receive, topic), qos, raw=True)

@@ -145,9 +145,8 @@ def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.nda
     angle = np.radians(group.azimuth_deg)
     arms = group.radius * np.stack([-np.sin(angle), np.cos(angle)])  # (2, k)
     tensions = moment @ np.linalg.pinv(arms).T
-    if (
-        len(angle) >= 3
-    ):  # equal tensions of evenly spread tendons cancel, so they can be added freely
+    if len(angle) >= 3:
+        # Equal tensions of evenly spread tendons cancel, so they can be added freely.
         tensions = tensions - tensions.min(axis=-1, keepdims=True)
     return np.maximum(tensions + pretension, pretension)
 

@@ -56,9 +56,8 @@ def _write(scene: Scene, entry: Path) -> None:
         **_pack('anomaly_vertices', [a.vertices for a in scene.anomalies]),
         **_pack('anomaly_faces', [a.faces for a in scene.anomalies], np.int32),
     }
-    with suppress(
-        OSError
-    ):  # a home that is full or read-only costs time on every start, nothing else
+    with suppress(OSError):
+        # A home that is full or read-only costs time on every start, nothing else.
         entry.parent.mkdir(parents=True, exist_ok=True)
         partial = entry.with_name(f'{entry.stem}.{os.getpid()}.tmp')
         with partial.open('wb') as file:

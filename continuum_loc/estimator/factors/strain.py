@@ -74,9 +74,8 @@ class StrainFactor(Factor):
         """
         s = np.concatenate([row[0] for row in rows])
         stations, station = rows[0][0], np.tile(np.arange(len(rows[0][0])), len(rows))
-        if len(s) != len(station) or not np.array_equal(
-            s, stations[station]
-        ):  # not the same stations every time
+        if len(s) != len(station) or not np.array_equal(s, stations[station]):
+            # Not the same stations every time.
             stations, station = np.unique(s, return_inverse=True)
         return (
             np.repeat(times, [len(row[0]) for row in rows]),
