@@ -22,11 +22,7 @@ TOF_NO_TARGET = 255
 
 
 def seconds(stamp: int, epoch: int = 0) -> float:
-    """
-    Time [s] from `epoch` to `stamp`, both in integer nanoseconds.
-
-    Exact to 1 ns over days.
-    """
+    """Time [s] from `epoch` to `stamp`, both in integer ns (exact to 1 ns over days)."""
     return (stamp - epoch) / NANOSECONDS
 
 
@@ -59,11 +55,7 @@ class TofFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
-    """
-    Angular velocity (3,) rad/s and specific force (3,) m/s^2 in the IMU's frame.
-
-    The force is +g at rest.
-    """
+    """Angular velocity (3,) rad/s, specific force (3,) m/s^2 (+g at rest) in the IMU's frame."""
 
     stamp: int
     sensor: str

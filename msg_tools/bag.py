@@ -141,11 +141,7 @@ def read_bag(
 def raw_messages(
     path: str | Path, topics: tuple[str, ...] | None = None, namespace: str | None = None
 ) -> Iterator[tuple[str, int, bytes]]:
-    """
-    (relative topic, log time in ns, serialised message) of a bag.
-
-    Selected as `read_bag` does.
-    """
+    """(relative topic, log time in ns, serialised message) of a bag, selected as by `read_bag`."""
     path = Path(path)
     with open_bag(path) as reader:
         names = contract_topics(path, reader.connections, namespace)

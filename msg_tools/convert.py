@@ -147,11 +147,7 @@ def transforms_of(poses: list, where: str) -> np.ndarray:
 
 
 def ros_covariance(covariance: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """
-    (36,) row-major covariance about the map's axes, of a (6, 6) one about the body's.
-
-    REP-103.
-    """
+    """(36,) row-major covariance about map axes (REP-103), of a (6, 6) one about body axes."""
     turn = np.kron(np.eye(2), R)
     return (turn @ covariance @ turn.T).reshape(36)
 

@@ -1,8 +1,4 @@
-"""
-The contract of topics: name, type, quality of service, how its content is written and read.
-
-The only such list.
-"""
+"""The one list of topics: name, type, quality of service, how content is written and read."""
 
 from __future__ import annotations
 

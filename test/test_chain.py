@@ -54,11 +54,7 @@ def test_solution_and_covariances_equal_dense_algebra(seed):
 
 
 def test_marginalising_equals_the_batch_solution():
-    """
-    Sliding a window of three columns over a linear problem ends where the batch does.
-
-    The batch is over all columns.
-    """
+    """Sliding a window of three columns over a linear problem ends where the whole batch does."""
     start, intervals = random_chain(7)
     H, g = dense(start, intervals)
     batch = np.linalg.solve(H, -g)

@@ -196,11 +196,7 @@ def test_both_flavours_serialise_to_the_same_content(topic, data):
 
 
 def test_the_pose_covariance_is_turned_into_the_axes_of_the_map():
-    """
-    Samples of T Exp(delta) scatter in map axes with the published covariance.
-
-    Positions and rotation vectors.
-    """
+    """Samples of T Exp(delta) scatter in map axes (position, rotation vector) as published."""
     rng = np.random.default_rng(3)
     T = lie.exp(np.array([0.3, -0.2, 0.5, 0.8, -1.1, 0.4]))
     A = rng.normal(size=(6, 6))

@@ -188,11 +188,7 @@ def test_no_study_rests_on_the_hold_out_and_no_two_cases_share_a_folder(quick):
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """
-    Synthetic recordings and a filter of known errors in place of the simulator's.
-
-    Tells how many filters were made.
-    """
+    """Synthetic recordings and a filter of known errors; counts how many filters were made."""
     made = []
 
     def filter_(robot, prior_map, settings):

@@ -1,8 +1,4 @@
-"""
-Test that the index is exact, for any cloud and query, whatever its cache holds.
-
-Against brute force and SciPy.
-"""
+"""The index is exact against brute force and SciPy, for any cloud, query and cache."""
 
 from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.voxel_index import PATIENCE, VoxelIndex

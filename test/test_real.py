@@ -42,11 +42,7 @@ def _write(path, kind, s, rows):
 
 @pytest.fixture
 def trial(tmp_path):
-    """
-    Write a straight robot along the map's z that turns about it at 0.5 rad/s.
-
-    In the files' own frames.
-    """
+    """Write a straight robot that turns about the map's z at 0.5 rad/s, in the files' frames."""
     folder = tmp_path / 'trial'
     folder.mkdir()
     times = np.arange(-0.04, 1.0, 0.02)

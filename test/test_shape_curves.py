@@ -73,11 +73,7 @@ def test_straight_is_a_line(method, projected):
 
 
 def nearly_straight(noise):
-    """
-    Points, tangents and truth of a straight robot with noise (15,).
-
-    On its modules and their tangents.
-    """
+    """Points, tangents and truth of a straight robot; noise (15,) on modules and tangents."""
     points, tangents, truth = sampled(bent(ROBOT, 0.0))
     noise = np.array(noise)
     points = points + np.vstack([np.zeros(3), noise[:9].reshape(3, 3)])

@@ -102,11 +102,7 @@ def test_dipole_on_axis_and_on_the_equator():
 
 
 def test_the_ring_is_no_dipole_at_the_modules():
-    """
-    The distance that a dipole would read from the ring's field on the axis is off.
-
-    By 0.59, 0.21 and 0.13 mm.
-    """
+    """A dipole reads the distance on the ring's axis wrong: by 0.59, 0.21 and 0.13 mm."""
     p = np.column_stack([ARCLENGTHS, 0 * ARCLENGTHS, 0 * ARCLENGTHS])
     read = invert_dipole(MAGNET, ring_field(MAGNET, p))[:, 0]
     np.testing.assert_allclose((read - ARCLENGTHS) * 1e3, [0.59, 0.21, 0.13], atol=0.006)

@@ -46,11 +46,7 @@ def run(filter_: SlidingWindowFilter, samples) -> tuple[list, dict]:
 
 
 def errors(estimates, truth) -> np.ndarray:
-    """
-    (K, R + 1, 6) body-frame pose errors of the estimates that have a true pose.
-
-    At their stamp.
-    """
+    """(K, R + 1, 6) body-frame pose errors of the estimates with a true pose at their stamp."""
     return np.array(
         [
             lie.log(lie.inverse(e.T_map_ring) @ truth[e.stamp])

@@ -106,11 +106,7 @@ def test_the_first_second_is_at_rest_and_then_the_tip_sweeps_decimetres(truth):
 
 
 def test_gyros_are_the_derivative_of_the_true_rotation(engine, truth):
-    """
-    Over a sampling interval the mean of two samples differs little from the chord.
-
-    By terms of second order.
-    """
+    """Over a sampling interval the mean of two samples is the chord but for second-order terms."""
     for ring in (1, 3, 5):
         gyro = np.array([s.angular_velocity for s in engine.of(ImuSample, f'ring{ring}_imu')])
         chord = (
@@ -315,11 +311,7 @@ def test_leaving_a_sensor_out_does_not_change_the_others():
 
 
 def test_tof_ranges_are_those_of_the_true_pose_at_their_own_stamps(scene):
-    """
-    Rays cast anew from the true ring poses meet the scene where the frame says.
-
-    In motion and between steps.
-    """
+    """Rays cast anew from the true ring poses meet the scene where the frame says, moving too."""
     from continuum_loc.simulator.raycast import RayCaster
 
     robot = load_robot('engine')
@@ -487,11 +479,7 @@ def test_there_are_enough_trajectories_and_seeds_vary_them():
 
 @pytest.mark.parametrize('robot', ['engine', 'soft_arm'])
 def test_contacts_hold_the_body_out_of_the_scene(robot):
-    """
-    Throughout, no node comes nearer to the mesh than the body's radius.
-
-    Less a few millimetres.
-    """
+    """No node ever comes nearer to the mesh than the body's radius less a few millimetres."""
     from continuum_loc.simulator.scenes import load_scene
     import open3d as o3d
 

@@ -59,11 +59,7 @@ class Blocks:
 
 @dataclass(slots=True, eq=False)
 class Message:
-    """
-    What the past says of a column, at its linearisation point.
-
-    Information (D, D) and gradient (D,).
-    """
+    """What the past says of a column: information (D, D) and gradient (D,), where linearised."""
 
     information: np.ndarray
     gradient: np.ndarray

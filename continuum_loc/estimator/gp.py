@@ -42,11 +42,7 @@ def _relative_twist(T_a, T_b, v_b, W, V, M):
 
 @njit(cache=True)
 def _chain_rate(scale_xi, scale_a, scale_w, W, J, scratch):
-    """
-    J (6, 24) = Jacobian of scale_xi xi + scale_a v_a + scale_w w.
-
-    W is as `_relative_twist` left it.
-    """
+    """J (6, 24) of scale_xi xi + scale_a v_a + scale_w w, from the W of `_relative_twist`."""
     G = scratch[0]
     for i in range(6):
         for j in range(6):

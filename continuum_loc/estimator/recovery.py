@@ -153,11 +153,7 @@ class Recovery:
         return outcome
 
     def look_after(self, time: float, converged: bool) -> None:
-        """
-        Notice a wrong minimum by the worst ring's share of fitting zones.
-
-        Then look for a better body.
-        """
+        """Notice a wrong minimum by the worst ring's fitting share, and look for a better body."""
         silent = self._silent(time)
         misfits = self._misfits() + silent
         if self._tof is None or not self._settings.enabled:
@@ -223,11 +219,7 @@ class Recovery:
         return misfits
 
     def _silent(self, time: float) -> list[str]:
-        """
-        Sensors without a usable sample for long while others of their kind speak.
-
-        They are silent, frozen or refused.
-        """
+        """Sensors long silent, frozen or refused while others of their kind speak."""
         silent = []
         for sensors in (self._robot.tof if self._tof is not None else (), self._robot.imu):
             ages = {sensor.name: time - self._heard.get(sensor.name, 0.0) for sensor in sensors}

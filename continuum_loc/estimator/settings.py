@@ -16,11 +16,7 @@ PRESETS_FOLDER = Path(__file__).parent / 'presets'
 
 
 class PriorSettings(Settings):
-    """
-    Process noise: power spectral densities by component of body-frame rates.
-
-    Components are [translation; rotation].
-    """
+    """Process noise: spectral densities of body-frame rates, translation then rotation."""
 
     velocity: Vector6 = Field(
         (0.1, 0.1, 0.1, 3.0, 3.0, 3.0),

@@ -1,8 +1,4 @@
-"""
-Batch smoother: the same factors over a whole recording, nothing marginalised.
-
-It is the accuracy reference.
-"""
+"""Batch smoother, the accuracy reference: a whole recording, nothing marginalised."""
 
 from __future__ import annotations
 

@@ -201,11 +201,7 @@ class Window:
         return changed[0] if changed else len(self.intervals)
 
     def _move(self, offsets: list[np.ndarray]) -> int:
-        """
-        Take the offsets; columns that moved far get a new linearisation point.
-
-        The first interval affected.
-        """
+        """Take the offsets, relinearise columns that moved far; the first interval affected."""
         first = len(self.intervals)
         far = self._pose_moves(offsets) >= self.settings.solver.relinearise
         for k, offset in enumerate(offsets):

@@ -1,8 +1,4 @@
-"""
-Anyone's own bags: the same tables, claims and report as for simulated trials.
-
-All from a folder of recordings.
-"""
+"""Anyone's own bags, a folder of them: tables, claims and report as for simulated trials."""
 
 from __future__ import annotations
 

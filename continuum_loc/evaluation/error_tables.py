@@ -22,11 +22,7 @@ COLUMNS = {
 
 
 def per_ring(outcomes: Iterable[Outcome], key: str, ring: str | None = None) -> np.ndarray:
-    """
-    Collect the figure `key` of each trial's rings, one value per trial and ring.
-
-    Of one ring, or of all.
-    """
+    """Collect the figure `key` of each trial's rings (or of one), a value per trial and ring."""
     return np.array(
         [
             entry[key]

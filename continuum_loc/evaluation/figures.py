@@ -245,11 +245,7 @@ def time_histogram(milliseconds: np.ndarray, title: str, limit: float | None = N
 
 
 def consistency_figure(result: ReplayResult, found: Errors) -> go.Figure:
-    """
-    Plot what the filter says of itself and what truth says of it, both 1 when honest.
-
-    Innovations and NEES.
-    """
+    """Plot what the filter (innovations) and truth (NEES) say of it, both 1 when honest."""
     import plotly.graph_objects as go
 
     epoch = int(result.track.stamps[0]) if len(result.track) else 0
@@ -491,11 +487,7 @@ def _play_buttons() -> dict:
 
 
 def thin(values: np.ndarray, most: int = MOST_SAMPLES) -> np.ndarray:
-    """
-    Pick at most `most` of the values (K,) by index, keeping the greatest of each stretch.
-
-    So no peak is lost.
-    """
+    """Pick the greatest of each stretch of the values (K,), at most `most`, by index."""
     if len(values) <= most:
         return np.arange(len(values))
     edges = np.linspace(0, len(values), most + 1).astype(int)

@@ -140,11 +140,7 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
 
 
 def settled(track: Track) -> Track:
-    """
-    Find the instants at which the filter claims to know where it is, or to be lost.
-
-    All but `initialising`.
-    """
+    """Find the instants at which the filter claims to know where it is, or to be lost."""
     return track if track.status is None else track.select(track.status != 'initialising')
 
 

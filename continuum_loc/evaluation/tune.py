@@ -107,11 +107,7 @@ def attempt(
 
 
 def cost(translation_m: float, rotation_deg: float, nees_per_dof: float) -> float:
-    """
-    Mean of the logarithms of both errors, and how far the NEES is from 1.
-
-    In either direction.
-    """
+    """Mean of the logarithms of both errors, and how far the NEES is from 1 either way."""
     values = np.array([translation_m, rotation_deg, nees_per_dof])
     if not np.all(values > 0.0):
         return math.inf

@@ -1,5 +1,1 @@
-"""
-Prior maps, their nearest-neighbour index, and what the sensors saw.
-
-The last: reconstruction and anomalies.
-"""
+"""Prior maps, their nearest-neighbour index, reconstruction of what the sensors saw, anomalies."""

@@ -172,11 +172,7 @@ def mahalanobis2(
 
 
 def tangential_variance(prior: PriorMap) -> float:
-    """
-    Variance [m^2] of a surface point about the nearest of blue-noise samples.
-
-    It holds along each tangent.
-    """
+    """Variance [m^2], along each tangent, of a surface point about the nearest of its samples."""
     return prior.spacing**2 / DENSITY / (4.0 * np.pi)
 
 
@@ -270,11 +266,7 @@ def wilson_lower_bound(successes: int, trials: int, z: float) -> float:
 
 
 class Truth(NamedTuple):
-    """
-    A known anomaly: its kind and the closed mesh of what was added or taken away.
-
-    Vertices (V, 3), faces (F, 3).
-    """
+    """A known anomaly: kind and closed mesh (V, 3), (F, 3) of what was added or taken away."""
 
     kind: Kind
     vertices: np.ndarray

@@ -1,8 +1,4 @@
-"""
-Point clouds with any per-point fields as binary PLY.
-
-Open3D, CloudCompare and MeshLab read it.
-"""
+"""Point clouds with any per-point fields as binary PLY, for Open3D, CloudCompare, MeshLab."""
 
 from __future__ import annotations
 

@@ -325,11 +325,7 @@ def _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
 
 @njit(cache=True, inline='always')
 def _never_nearest(points, p, pool, other, x, y, z, edge):
-    """
-    Whether `pool[other]` is closer than `points[p]` at every place of the box (x, y, z).
-
-    x, y, z is its centre.
-    """
+    """Whether `pool[other]` is closer than `points[p]` everywhere in the box about (x, y, z)."""
     p2 = _distance2(points, p, x, y, z)
     other2 = _distance2(pool, other, x, y, z)
     swing = edge * (

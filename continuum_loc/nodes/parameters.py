@@ -94,11 +94,7 @@ def guard(node: Node, apply: Callable[[dict[str, Any]], str | None]) -> None:
 
 
 def live_fields(model: type[Settings]) -> set[str]:
-    """
-    Names of the fields that may change while the node runs.
-
-    They are declared with json_schema_extra live=True.
-    """
+    """Names of the fields that may change at run time (json_schema_extra live=True)."""
     return {
         name
         for name, field in model.model_fields.items()

@@ -42,11 +42,7 @@ def transform_message(
 def body_transforms(
     make: Messages, robot: RobotDescription, prefix: str, stamp: int, T_map_ring: np.ndarray
 ) -> list:
-    """
-    Map -> base_link, and base_link -> each ring, of T_map_ring (R + 1, 4, 4).
-
-    The base is first.
-    """
+    """Map -> base_link, base_link -> each ring, of T_map_ring (R + 1, 4, 4), the base first."""
     base = prefix + BASE_LINK
     T_base_ring = lie.inverse(T_map_ring[0]) @ T_map_ring[1:]
     rings = [

@@ -204,11 +204,7 @@ def _ring(strength, half_length, inner, outer, p, field, gradient):
 
 @njit(cache=True)
 def _sheet(a, half_length, rho, x):
-    """
-    B_rho, B_x, dB_rho/dx and dB_x/dx of a unit current sheet of radius a.
-
-    Unit: remanence / pi = 1.
-    """
+    """B_rho, B_x, dB_rho/dx, dB_x/dx of a unit current sheet (remanence / pi = 1), radius a."""
     gamma = (a - rho) / (a + rho)
     if gamma == 0.0:
         gamma = 1e-15  # the integral's limit at rho = a

@@ -120,11 +120,7 @@ def _last_readings(
     background: Background,
     mends: frozenset[str],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    R_world_imu (M, 3, 3) by the paper's filter after all samples, and the last fields.
-
-    Fields are (M, 3).
-    """
+    """R_world_imu (M, 3, 3) by the paper's filter after all samples; the last fields (M, 3)."""
     filters = [
         EulerFilter(
             swap_as_printed='swap' not in mends,

@@ -27,11 +27,7 @@ class MotionError(ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rest:
-    """
-    Mean readings of M modules at rest: gyro, accel, field (M, 3).
-
-    Each in its sensor's frame.
-    """
+    """Mean readings of M modules at rest: gyro, accel, field (M, 3), in the sensors' frames."""
 
     gyro: np.ndarray
     accel: np.ndarray

@@ -151,11 +151,7 @@ def s_shape(
 
 
 def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi / 2) -> np.ndarray:
-    """
-    (N, 3) strain of `curvature` [1/m] whose bending plane turns from base to tip.
-
-    By `turn` [rad].
-    """
+    """(N, 3) strain of `curvature` [1/m]; its bending plane turns by `turn` [rad] in all."""
     return profile(robot, lambda s: (np.full_like(s, curvature), turn * s / robot.length))
 
 

@@ -130,11 +130,7 @@ def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
 
 
 def backbone(T_map_node: np.ndarray, nodes_s: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """
-    Poses (..., 4, 4) of T_map_backbone along the arcs through the nodes.
-
-    s (...) is in [0, L].
-    """
+    """Poses (..., 4, 4) in map of the backbone at s (...) in [0, L], along arcs through nodes."""
     s = np.asarray(s, float)
     if np.any(s < nodes_s[0] - 1e-9) or np.any(s > nodes_s[-1] + 1e-9):
         raise ValueError(

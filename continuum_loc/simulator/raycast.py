@@ -44,11 +44,7 @@ class RayCaster:
         return hits['t_hit'].numpy().astype(float), faces, normals
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """
-        Distance (N,) from points (N, 3) to the nearest surface [m].
-
-        It is negative inside solid matter.
-        """
+        """Distance (N,) from points (N, 3) to the nearest surface [m], negative inside solids."""
         return (
             self._embree.compute_signed_distance(self._tensor(np.asarray(points, np.float32)))
             .numpy()

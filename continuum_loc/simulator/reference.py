@@ -38,11 +38,7 @@ def elastica_tip(force: float, EI: float, length: float) -> tuple[float, float]:
 
 
 def first_frequency(EI: float, mass_per_metre: float, length: float) -> float:
-    """
-    First bending frequency [Hz] of a slender cantilever without gravity.
-
-    By Euler and Bernoulli.
-    """
+    """First bending frequency [Hz] of an Euler-Bernoulli cantilever without gravity."""
     return (FIRST_MODE / length) ** 2 * np.sqrt(EI / mass_per_metre) / (2.0 * np.pi)
 
 

@@ -126,11 +126,7 @@ def wrap(x: np.ndarray, azimuth: np.ndarray, radius: np.ndarray) -> np.ndarray:
 def lathe(
     profile: np.ndarray, segments: int, azimuth_deg: tuple[float, float] = (-180.0, 180.0)
 ) -> Manifold:
-    """
-    Revolve a closed profile (n, 2) of (x, r) about the map's x axis.
-
-    Over a range of azimuth.
-    """
+    """Revolve a profile (n, 2) of (x, r) about the map's x axis over a range of azimuth."""
     profile = np.asarray(profile, dtype=float)
     radius_x = profile[:, ::-1]
     if _signed_area(radius_x) < 0.0:

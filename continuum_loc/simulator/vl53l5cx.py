@@ -247,11 +247,7 @@ def _targets(depth, signal, width, threshold, closest):
 
 @njit(cache=True)
 def _gather(depth, signal, centre, width):
-    """
-    Total, mean depth and standard deviation of the returns within `width` of a depth.
-
-    They are weighted.
-    """
+    """Total, mean and standard deviation of the returns within `width` of a depth, weighted."""
     total, first, second = 0.0, 0.0, 0.0
     for j in range(len(depth)):
         offset = depth[j] - centre

@@ -38,11 +38,7 @@ class Case:
 
 
 def fault_rows(robot: RobotDescription, seed: int) -> list[dict[str, Any]]:
-    """
-    Tell what a calibrated estimator says first in each case, how late, and whether it is right.
-
-    Late: after the fault began.
-    """
+    """Tell what a calibrated estimator says first in each case, how soon, and if it is right."""
     arm = Arm(robot, seed=seed)
     calibration = calibrate(robot, arm.calibration_rests())
     return [

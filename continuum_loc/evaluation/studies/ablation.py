@@ -1,8 +1,4 @@
-"""
-What each sensor and each part of the filter is worth on the engine robot.
-
-And cold starts without strain.
-"""
+"""What each sensor and part of the filter is worth on the engine; cold starts without strain."""
 
 from __future__ import annotations
 

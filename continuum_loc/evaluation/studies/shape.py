@@ -176,11 +176,7 @@ def _printed_rows(seed: int) -> list[Row]:
 
 
 def _free_rows(seed: int) -> list[Row]:
-    """
-    One calibrated arm in an arc, an S and a bend that turns out of its plane.
-
-    Both forms of every curve.
-    """
+    """One calibrated arm in an arc, an S and a bend out of its plane, by all forms of curves."""
     robot = load_robot('hall_arm')
     arm = Arm(robot, seed=seed)
     calibration = calibrate(robot, arm.calibration_rests())

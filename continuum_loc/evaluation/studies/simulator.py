@@ -90,11 +90,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def settled_tip(model: Any, force: np.ndarray, moment: np.ndarray) -> np.ndarray:
-    """
-    (4, 4) pose of a `uniform_rod`'s tip at rest under an end force [N] and moment [N m].
-
-    In the map frame.
-    """
+    """(4, 4) T_map_tip of a `uniform_rod` at rest under an end force [N] and moment [N m]."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -271,11 +267,7 @@ def _vibration_claims(rows: list[dict[str, float]]) -> Iterator[Claim]:
 
 
 def _noise(seed: int) -> Iterator[dict[str, Any]]:
-    """
-    Kolmogorov-Smirnov p-value of each sensor's error at rest over its model's sigma.
-
-    Against the normal law.
-    """
+    """Kolmogorov-Smirnov p-value of each sensor's error at rest over its sigma, for N(0, 1)."""
     from scipy import stats
 
     for sensor, z in _normalised_errors(seed):
@@ -363,11 +355,7 @@ def _tof_errors(robot: RobotDescription, seed: int) -> np.ndarray:
 
 
 def _consistency(trajectory: str, duration: float) -> dict[str, Any]:
-    """
-    Root mean square of the gyros' departure from the chords of the true rotation.
-
-    In per cent of the motion's.
-    """
+    """RMS of the gyros' departure from the chords of the true rotation, in % of the motion's."""
     robot = _quiet(load_robot('engine'))
     samples = list(World(robot, None, trajectory).run(duration))
     truth = np.array([s.T_map_ring for s in samples if type(s) is TruthSample])

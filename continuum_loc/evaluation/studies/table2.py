@@ -1,8 +1,4 @@
-"""
-Table II of the localisation paper: the engine, S0 as the prior map.
-
-Scenes S0-S9 with three trajectories each.
-"""
+"""Table II of the localisation paper: scenes S0-S9, three trajectories each, map of S0."""
 
 from __future__ import annotations
 
