@@ -115,6 +115,20 @@ class Chain:
             )
         return _symmetrised(covariance)
 
+    def quadratic(self, C: np.ndarray) -> np.ndarray:
+        """
+        C^T H^-1 C (S, S) for C (K, D, S) over all columns, with H the chain's information.
+
+        One forward substitution: y_k = L_k^-1 (C_k - Y_k-1^T y_k-1), the sum of y_k^T y_k.
+        """
+        total, right = np.zeros((C.shape[2], C.shape[2])), C[0]
+        for k in range(len(C)):
+            y = blas.dtrsm(1.0, self._factor(k), right, lower=1)
+            total += y.T @ y
+            if k + 1 < len(C):
+                right = C[k + 1] - self._eliminated[k].Y.T @ y
+        return total
+
     def _factor(self, column: int) -> np.ndarray:
         return self._eliminated[column].L if column < len(self._eliminated) else self._last[0]
 

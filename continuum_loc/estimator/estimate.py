@@ -28,6 +28,7 @@ class Estimate:
     consistency: mean normalised innovation squared per measured dimension in the window (1 when
     honest).
     inliers: share of usable zones that fit the map, by ToF sensor.
+    suspects: why a sensor is not to be believed, by name.
     lagged: the same body at `stamp - lag`, smoothed by everything since; None before there is one.
     """
 
@@ -42,7 +43,7 @@ class Estimate:
     status: Status
     consistency: float
     inliers: dict[str, float] = field(default_factory=dict)
-    suspects: tuple[str, ...] = ()
+    suspects: dict[str, str] = field(default_factory=dict)
     iterations: int = 0
     converged: bool = True
     step_seconds: float = 0.0

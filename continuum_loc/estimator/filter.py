@@ -15,7 +15,8 @@ import time as clock
 from continuum_loc.estimator.chain import SingularError
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.factors import Factor, FACTORS, MeasurementError, TofFactor
-from continuum_loc.estimator.output import backbone, BodyState
+from continuum_loc.estimator.health import Health
+from continuum_loc.estimator.output import backbone, BodyState, rattle_covariance
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
 from continuum_loc.estimator.recovery import place, Recovery
@@ -70,7 +71,10 @@ class SlidingWindowFilter:
         self.newest: int = 0
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
-        self.recovery = Recovery(self.robot, self.window, self.tof, self.settings.recovery)
+        self.health = Health(self.robot, self.window, self.factors, self.settings.health)
+        self.recovery = Recovery(
+            self.robot, self.window, self.tof, self.health, self.settings.recovery
+        )
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle: set[str] = set()
         self._last_cycle: set[str] = set()
@@ -116,7 +120,11 @@ class SlidingWindowFilter:
             raise ValueError('nothing was estimated yet: process measurements first')
         if not 0.0 <= s <= self.robot.length:
             raise ValueError(f'arclength {s} m is off the body; valid: 0 to {self.robot.length} m')
-        return state_at(self.window, self.history, seconds(stamp, self.epoch), s)
+        time = seconds(stamp, self.epoch)
+        state = state_at(self.window, self.history, time, s)
+        if time >= self.window.columns[0].time:
+            state.covariance[:6, :6] += self._rattle_covariance(time, np.array([s]))[0]
+        return state
 
     def resolve(self, stamps: Sequence[int]) -> list[Estimate]:
         """
@@ -157,7 +165,7 @@ class SlidingWindowFilter:
             self.counts['used'][type(measurement).__name__] += 1
             self.newest = max(self.newest, measurement.stamp)
             self._rest.note(measurement)
-            self.recovery.hear(getattr(measurement, 'sensor', ''), time)
+            self.health.hear(getattr(measurement, 'sensor', ''), time)
         return any(used)
 
     def _add(self, factor: Factor, time: float, measurement: Measurement) -> bool:
@@ -263,6 +271,14 @@ class SlidingWindowFilter:
             lagged = self._compose(before, fit, iterations, converged, started, None)
         return self._compose(now, fit, iterations, converged, started, lagged)
 
+    def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:
+        """Covariance (m, 6, 6) at s (m,) of what gyros feel and the motion of the knots misses."""
+        variances = self.window.rattle(time)
+        imus = sorted(variances, key=self.robot.sensor_arclength)
+        turns = np.sqrt([variances[name] for name in imus]).reshape(-1, 3)
+        s_imu = np.array([self.robot.sensor_arclength(name) for name in imus])
+        return rattle_covariance(s_imu, turns, s)
+
     def _compose(
         self,
         time: float,
@@ -275,6 +291,7 @@ class SlidingWindowFilter:
         rings, body = self.grid.ring_nodes, self.window.body(time)
         covariance = self.window.motion_covariance(time, rings)
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
+        covariance[:, :6, :6] += self._rattle_covariance(time, self.grid.s[rings])
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
         return Estimate(
             stamp=self.epoch + nanoseconds(time),
@@ -288,7 +305,7 @@ class SlidingWindowFilter:
             status=self.recovery.status,
             consistency=fit.squared / max(fit.count, 1),
             inliers=fit.shares,
-            suspects=self.recovery.suspects,
+            suspects=dict(self.health.reasons),
             iterations=iterations,
             converged=converged,
             step_seconds=clock.perf_counter() - started,

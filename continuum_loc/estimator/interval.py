@@ -7,7 +7,7 @@ Its measurements, and their normal equations at the current linearisation.
 from __future__ import annotations
 
 from continuum_loc.estimator.chain import Blocks
-from continuum_loc.estimator.factors import Factor, FactorReport
+from continuum_loc.estimator.factors import ClockScores, Factor, FactorReport
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Column
 import numpy as np
@@ -47,6 +47,11 @@ class Interval:
             self.reports[factor.name] = report
             self.blocks.cost += report.cost
         self.changed = False
+
+    def clock_scores(self, factor: Factor, a: Column, b: Column) -> ClockScores | None:
+        """How the factor's measurements here would change with their sensors' clocks."""
+        batch = self._batches.get(factor)
+        return None if batch is None else factor.clock_scores(batch, a, b)
 
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
         """Cost that the quadratic model gives at offsets from the linearisation point."""

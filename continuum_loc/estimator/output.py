@@ -9,6 +9,7 @@ from continuum_loc.estimator import gp
 from continuum_loc.estimator.state import Column, Grid, NODE_DIM
 from numba import njit
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
@@ -129,6 +130,24 @@ def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -
     open_bridge = np.empty((2, 2))
     gp.bridge(time - a.time, b.time - a.time, open_bridge)
     return np.kron(open_bridge, velocity_psd[:, :, None] * np.eye(6))
+
+
+def rattle_covariance(s_imu: np.ndarray, turns: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """
+    Covariance (m, 6, 6) at arclengths s (m,) of a motion too fast for the knots.
+
+    turns: (I, 3) its standard deviation about each axis at IMUs s_imu (I,), which increase [rad].
+    The clamped base does not rattle, and turns move what is beyond them sideways: the lateral
+    deviations are the turns' integrals along the body, as for one mode of bending.
+    """
+    at = np.append(0.0, s_imu)
+    turn = np.vstack([np.zeros(3), turns])
+    shift = cumulative_trapezoid(turn, at, axis=0, initial=0.0)
+    deviation = np.zeros((len(s), 6))
+    for i in range(3):
+        deviation[:, 3 + i] = np.interp(s, at, turn[:, i])
+    deviation[:, 1], deviation[:, 2] = np.interp(s, at, shift[:, 2]), np.interp(s, at, shift[:, 1])
+    return np.square(deviation)[:, :, None] * np.eye(6)
 
 
 @njit(cache=True)

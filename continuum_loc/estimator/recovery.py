@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from continuum_loc import lie
 from continuum_loc.estimator.estimate import Status
 from continuum_loc.estimator.factors.tof import associate, frame_information, TofFactor
+from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Column, Grid, shape_from_strain
@@ -33,8 +34,6 @@ COARSE_SPACING = 0.04
 ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
 SEARCH_INTERVALS = 2  # the newest, whose measurements decide between bodies
 GATE_SHRINK = 0.75  # of the gate of association, at each iteration from a guess
-# Of the median sensor's samples fit, else the body is in doubt and no single sensor.
-HEALTHY_SHARE = 0.85
 AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
 
@@ -98,7 +97,7 @@ class Recovery:
     """
     Acquires the body at the start, watches over it, and finds it again.
 
-    acquired: whether the filter tracks; suspects: sensors that do not fit while the others do.
+    acquired: whether the filter tracks.
     """
 
     def __init__(
@@ -106,13 +105,12 @@ class Recovery:
         robot: RobotDescription,
         window: Window,
         tof: TofFactor | None,
+        health: Health,
         settings: RecoverySettings,
     ):
         self.acquired = False
-        self.suspects: tuple[str, ...] = ()
         self._robot, self._window, self._tof, self._settings = robot, window, tof, settings
-        self._watch = Watch(settings)
-        self._heard: dict[str, float] = {}
+        self._health, self._watch = health, Watch(settings)
         self._doubt = 0.0
         self._shapes = (
             None if tof is None else ShapeSearch(window.grid, tof, settings, window.priors)
@@ -124,10 +122,6 @@ class Recovery:
         if self._watch.lost:
             return 'lost'
         return 'tracking' if self.acquired else 'initialising'
-
-    def hear(self, sensor: str, time: float) -> None:
-        """Note that a sensor gave a usable sample at `time` [s]."""
-        self._heard[sensor] = max(time, self._heard.get(sensor, time))
 
     def doubt(self, s: np.ndarray) -> np.ndarray:
         """
@@ -154,22 +148,10 @@ class Recovery:
 
     def look_after(self, time: float, converged: bool) -> None:
         """Notice a wrong minimum by the worst ring's fitting share, and look for a better body."""
-        silent = self._silent(time)
-        misfits = self._misfits() + silent
+        self._health.look(time, body_believed=False)
         if self._tof is None or not self._settings.enabled:
             self.acquired = self.acquired or converged
-            self._suspect(misfits)
             return
-        # A ToF sensor that does not fit may be broken, or the body wrong: only a search that finds
-        # no better body tells, so that only then it is a suspect and no longer counts.
-        tof_names = {sensor.name for sensor in self._robot.tof}
-        self._suspect(
-            [
-                name
-                for name in misfits
-                if name in self.suspects or name not in tof_names or name in silent
-            ]
-        )
         share = self._worst_share()
         fitting = share >= self._settings.suspect_share
         self.acquired = self.acquired or (converged and fitting)
@@ -178,7 +160,7 @@ class Recovery:
             confirmed = self._search()
             self._watch.searched(time, confirmed)
             if confirmed:
-                self._suspect(self._misfits() + silent)
+                self._health.look(time, body_believed=True)
         self._doubt = self._how_doubtful(self._worst_share())
 
     def _narrow(self, iteration: int) -> bool:
@@ -199,33 +181,9 @@ class Recovery:
         fits = self._window.newest_fits('tof')
         by_ring: dict[str, np.ndarray] = {}
         for sensor in self._robot.tof:
-            if sensor.name in fits and sensor.name not in self.suspects:
+            if sensor.name in fits and sensor.name not in self._health.reasons:
                 by_ring[sensor.ring] = by_ring.get(sensor.ring, 0.0) + fits[sensor.name]
         return min((fit[1] / fit[0] for fit in by_ring.values() if fit[0] > 0), default=1.0)
-
-    def _misfits(self) -> list[str]:
-        """
-        Sensors that do not fit while others of their kind do.
-
-        A wrong extrinsic, a wrong clock, a broken part.
-        """
-        shares, misfits = self._window.fit().shares, []
-        for sensors in (self._robot.tof, self._robot.imu):
-            names = [sensor.name for sensor in sensors if sensor.name in shares]
-            healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
-            misfits += [
-                name for name in names if healthy and shares[name] < self._settings.sensor_share
-            ]
-        return misfits
-
-    def _silent(self, time: float) -> list[str]:
-        """Sensors long silent, frozen or refused while others of their kind speak."""
-        silent = []
-        for sensors in (self._robot.tof if self._tof is not None else (), self._robot.imu):
-            ages = {sensor.name: time - self._heard.get(sensor.name, 0.0) for sensor in sensors}
-            if ages and min(ages.values()) < self._settings.silence:
-                silent += [name for name, age in ages.items() if age >= self._settings.silence]
-        return silent
 
     def _how_doubtful(self, share: float) -> float:
         """
@@ -239,12 +197,6 @@ class Recovery:
         if self._watch.since is None or self._watch.backoff > 1.0:
             return 0.0
         return max(1.0 - share / self._settings.suspect_share, 0.0)
-
-    def _suspect(self, names: list[str]) -> None:
-        self.suspects = tuple(names)
-        if self._tof is not None:
-            for name in self._tof.weights:
-                self._tof.weights[name] = self._settings.suspect_weight if name in names else 1.0
 
     def _search(self) -> bool:
         """

@@ -215,6 +215,16 @@ class RecoverySettings(Settings):
     margin: float = Field(
         0.1, ge=0.0, description="share by which another body's cost must be lower to be taken"
     )
+    lost_sigma: tuple[float, float] = Field(
+        (0.1, 0.3),
+        description="spread added to the tip's pose while lost, less "
+        'towards the base and while in doubt [m, rad]',
+    )
+
+
+class HealthSettings(Settings):
+    """Which sensors are suspect."""
+
     sensor_share: float = Field(
         0.7,
         ge=0.0,
@@ -226,12 +236,23 @@ class RecoverySettings(Settings):
         0.5, gt=0.0, description='time without a usable sample that makes a sensor suspect [s]'
     )
     suspect_weight: float = Field(
-        0.05, gt=0.0, le=1.0, description='weight of a suspect ToF sensor'
+        0.05, gt=0.0, le=1.0, description='weight of a suspect ToF sensor or gyro'
     )
-    lost_sigma: tuple[float, float] = Field(
-        (0.1, 0.3),
-        description="spread added to the tip's pose while lost, less "
-        'towards the base and while in doubt [m, rad]',
+    flicker_share: float = Field(
+        0.15,
+        gt=0.0,
+        le=1.0,
+        description='share of zones that match the map in one frame and not in the next, above '
+        'which a ToF sensor is noisy',
+    )
+    clock_offset: float = Field(
+        0.025, gt=0.0, description='least offset of a clock that is told [s]'
+    )
+    clock_sigmas: float = Field(
+        5.0, gt=0.0, description='how many standard deviations it must be from none'
+    )
+    clock_period: float = Field(
+        0.4, ge=0.0, description='time between two tests of the clocks; 0 switches them off [s]'
     )
 
 
@@ -267,6 +288,7 @@ class EstimatorSettings(Settings):
     field: FieldSettings = FieldSettings()
     solver: SolverSettings = SolverSettings()
     recovery: RecoverySettings = RecoverySettings()
+    health: HealthSettings = HealthSettings()
 
 
 def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSettings:

@@ -279,6 +279,30 @@ class Window:
         """Rows of a factor in the newest `count` intervals, in order of arrival."""
         return [row for interval in self.intervals[-count:] for row in interval.rows(factor)]
 
+    def flicker(self) -> dict[str, float]:
+        """Share of each ToF sensor's zones that the map matched in one of two frames in a row."""
+        counts: dict[str, np.ndarray] = {}
+        for interval in self.intervals:
+            if 'tof' in interval.reports:
+                for name, count in interval.reports['tof'].flicker.items():
+                    counts[name] = counts.get(name, 0.0) + count
+        return {name: float(changed / seen) for name, (seen, changed) in counts.items()}
+
+    def rattle(self, time: float) -> dict[str, np.ndarray]:
+        """
+        Variance (3,) by gyro of the turns that are too fast for the knots, about `time` [rad^2].
+
+        The larger of the interval's that holds `time` and the one before: the newest may have
+        just begun.
+        """
+        k = self.knot_before(time)
+        found: dict[str, np.ndarray] = {}
+        for interval in self.intervals[max(k - 1, 0) : k + 1]:
+            if 'gyro' in interval.reports:
+                for name, variance in interval.reports['gyro'].rattle.items():
+                    found[name] = np.maximum(found.get(name, 0.0), variance)
+        return found
+
     def knot_before(self, time: float) -> int:
         """Return the interval that holds `time`, clipped to the window."""
         k = int(np.searchsorted([column.time for column in self.columns], time - TIME_EPSILON)) - 1

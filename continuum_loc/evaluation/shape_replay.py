@@ -63,5 +63,5 @@ def as_estimate(shape: ShapeEstimate, T_map_base: np.ndarray) -> Estimate:
         T_map_backbone=T_map_backbone,
         status='lost' if shape.faults else 'tracking',
         consistency=shape.consistency,
-        suspects=tuple(shape.faults),
+        suspects={name: ', '.join(reasons) for name, reasons in shape.faults.items()},
     )

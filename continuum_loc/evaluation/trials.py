@@ -13,9 +13,12 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from continuum_loc import lie
 from continuum_loc.evaluation.replay import Filter, replay, ReplayResult
 from continuum_loc.measurements import Measurement, TrackedPose, TruthSample
 from continuum_loc.robot import load_robot, RobotDescription
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
@@ -48,6 +51,8 @@ class Trial:
     map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
     `paper` or `vl53l5cx`.
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
+    drawn_base: the base sits where a draw from the description's own spread puts it, not where
+    the description says: what a covariance that counts with this spread has to be judged by.
     duration: seconds; None for the trajectory's own.
     """
 
@@ -58,6 +63,7 @@ class Trial:
     profile: str = 'live'
     fidelity: str = 'paper'
     disturbed: bool = False
+    drawn_base: bool = False
     seed: int = 0
     duration: float | None = None
 
@@ -75,6 +81,7 @@ class Trial:
                     self.profile,
                 ]
                 + ['disturbed'] * self.disturbed
+                + ['drawn'] * self.drawn_base
             )
             + f'-{self.seed}{length}'
         )
@@ -91,6 +98,8 @@ def world(trial: Trial, faults: tuple = ()) -> World:
     from continuum_loc.simulator.world import World
 
     robot = load_robot(trial.robot)
+    if trial.drawn_base:
+        robot = _base_drawn(robot, trial.seed)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
     return World(
@@ -102,6 +111,16 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         seed=trial.seed,
         faults=faults,
     )
+
+
+def _base_drawn(robot: RobotDescription, seed: int) -> RobotDescription:
+    """Move the robot's base by a draw from the spread that its description states."""
+    base = robot.base
+    sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
+    T_map_base = base.T_map_base @ lie.exp(sigma * np.random.default_rng(seed).normal(size=6))
+    rpy_deg = Rotation.from_matrix(T_map_base[:3, :3]).as_euler('xyz', degrees=True)
+    moved = {'xyz': tuple(T_map_base[:3, 3]), 'rpy_deg': tuple(rpy_deg)}
+    return robot.model_copy(update={'base': type(base)(**{**base.model_dump(), **moved})})
 
 
 def _disturbed(

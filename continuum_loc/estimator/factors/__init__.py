@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from continuum_loc.estimator.factors.base import Factor, FactorReport, MeasurementError
+from continuum_loc.estimator.factors.base import (
+    ClockScores,
+    Factor,
+    FactorReport,
+    MeasurementError,
+)
 from continuum_loc.estimator.factors.field import FieldFactor
 from continuum_loc.estimator.factors.gravity import GravityFactor
 from continuum_loc.estimator.factors.gyro import GyroFactor
@@ -19,4 +24,4 @@ FACTORS: tuple[type[Factor], ...] = (
     FieldFactor,
 )
 
-__all__ = ['FACTORS', 'Factor', 'FactorReport', 'MeasurementError', 'TofFactor']
+__all__ = ['ClockScores', 'FACTORS', 'Factor', 'FactorReport', 'MeasurementError', 'TofFactor']

@@ -34,14 +34,34 @@ class FactorReport:
     """
     How an interval's measurements of one kind fit.
 
-    Robust cost, sum of squared normalised residuals and their number, and for each sensor its
-    [usable, fitting] counts.
+    Robust cost, sum of squared normalised residuals and their number, for each sensor its
+    [usable, fitting] counts, and for each gyro the variance (3,) of the turns that the motion
+    between the knots does not follow [rad^2]. `flicker` counts for each ToF sensor zones seen in
+    two frames in a row, and those of them that the map matched in just one.
     """
 
     cost: float = 0.0
     squared: float = 0.0
     count: int = 0
     fits: dict[str, np.ndarray] = field(default_factory=dict)
+    rattle: dict[str, np.ndarray] = field(default_factory=dict)
+    flicker: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClockScores:
+    """
+    How an interval's cost depends on its S sensors' clocks, to second order.
+
+    gradient, information: (S,); coupling (2 D, S) with the offsets of the interval's two columns;
+    spread: (S,) variance of the residuals that no offset explains over that of the noise.
+    """
+
+    sensors: list[str]
+    gradient: np.ndarray
+    information: np.ndarray
+    coupling: np.ndarray
+    spread: np.ndarray
 
 
 class Factor(ABC):
@@ -52,6 +72,7 @@ class Factor(ABC):
 
     def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
         self.robot, self.grid, self.settings = robot, grid, settings
+        self.weights: dict[str, float] = {}  # of sensors that may become suspect
 
     @abstractmethod
     def row(self, measurement: Any) -> tuple:
@@ -68,6 +89,10 @@ class Factor(ABC):
     @abstractmethod
     def linearise(self, batch: tuple, a: Column, b: Column, blocks: Blocks) -> FactorReport:
         """Add the normal equations of `batch` between the columns a and b."""
+
+    def clock_scores(self, batch: tuple, a: Column, b: Column) -> ClockScores | None:
+        """Say how the cost depends on the sensors' clocks; None where that is not asked for."""
+        return None
 
 
 class Repeats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import (
+    ClockScores,
     Factor,
     FactorReport,
     known_sensor,
@@ -18,6 +19,8 @@ from numba import njit
 import numpy as np
 
 # An IMU fits while its mean residual is below four sigmas of one sample; rattling averages out.
+RATTLE_SQUARED = 9.0  # three standard deviations of its angle
+CLOCK_STEP = 0.004  # [s] for the slope of the rate
 FIT_SQUARED = 16.0
 MOST_REPEATS = 20  # a real gyro at rest repeats a sample now and then, through its quantisation
 
@@ -39,6 +42,7 @@ class GyroFactor(Factor):
             )
             for number, imu in enumerate(robot.imu)
         }
+        self.weights = dict.fromkeys(self._imus, 1.0)
         self._weight = (settings.gyro.scale * robot.imu_model.gyro_sigma) ** -2.0
 
     def row(self, measurement: ImuSample) -> tuple:
@@ -57,16 +61,12 @@ class GyroFactor(Factor):
         return number, node, R_ring_imu @ measurement.angular_velocity
 
     def stack(self, times, rows):
-        return (
-            times,
-            np.array([row[0] for row in rows]),
-            np.array([row[1] for row in rows]),
-            np.array([row[2] for row in rows]),
-        )
+        order = np.argsort(times, kind='stable')  # `_turned` integrates, whatever came late
+        return (times[order], *(np.array([rows[m][i] for m in order]) for i in range(3)))
 
     def linearise(self, batch, a, b, blocks):
         times, imus, nodes, omega = batch
-        fits = np.zeros((len(self._imus), 2))
+        residuals = np.empty((len(times), 3))
         cost, squared = _add(
             blocks.H,
             blocks.g,
@@ -81,13 +81,81 @@ class GyroFactor(Factor):
             imus,
             omega,
             self._weight,
+            self._shares(),
             self.settings.gyro.cauchy,
             self.grid.bias_offset,
-            fits,
+            residuals,
         )
-        return FactorReport(
-            cost, squared, 3 * len(times), dict(zip(self._imus, fits, strict=True))
+        fits, rattle = self._judge(times, imus, residuals)
+        return FactorReport(cost, squared, 3 * len(times), fits, rattle)
+
+    def _shares(self) -> np.ndarray:
+        return np.array(list(self.weights.values()))
+
+    def clock_scores(self, batch, a, b):
+        times, imus, nodes, omega = batch
+        names, number = np.unique(imus, return_inverse=True)
+        gradient, information = np.zeros(len(names)), np.zeros(len(names))
+        coupling, squared = np.zeros((2 * self.grid.dim, len(names))), np.zeros(len(names))
+        _add_clocks(
+            gradient,
+            information,
+            coupling,
+            squared,
+            number,
+            a.T,
+            a.velocity,
+            b.T,
+            b.velocity,
+            a.bias,
+            b.time - a.time,
+            times,
+            nodes,
+            imus,
+            omega,
+            self.grid.bias_offset,
         )
+        weight = self._weight * self._shares()[names]
+        # What no offset explains of the rates may be more than noise: a body that rattles.
+        unexplained = squared - gradient**2 / np.maximum(information, 1e-12)
+        sensors = list(self._imus)
+        return ClockScores(
+            [sensors[i] for i in names],
+            weight * gradient,
+            weight * information,
+            weight * coupling,
+            self._weight * unexplained / (3.0 * np.bincount(number)),
+        )
+
+    def _judge(
+        self, times: np.ndarray, imus: np.ndarray, residuals: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Count [usable, fitting] samples by IMU, and take the variance (3,) of its rattle."""
+        fits, rattle = {}, {}
+        for number, name in enumerate(self._imus):
+            own = imus == number
+            if not own.any():
+                continue
+            count, mean = int(own.sum()), residuals[own].mean(axis=0)
+            rattle[name] = self._rattle(times[own], residuals[own])
+            # A rattle that ends within the interval leaves a mean rate too.
+            rate2 = RATTLE_SQUARED * np.sum(rattle[name]) / max(np.ptp(times[own]), 1e-3) ** 2
+            fitting = mean @ mean < FIT_SQUARED / self._weight + rate2
+            fits[name] = np.array([count, count * fitting])
+        return fits, rattle
+
+    def _rattle(self, times: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+        """
+        Variance (3,) of the angle that residual rates (M, 3) at times (M,) integrate to [rad^2].
+
+        White noise of the gyro alone makes a random walk of variance T / 6 about its mean, which
+        is taken off.
+        """
+        if len(times) < 3:
+            return np.zeros(3)
+        steps = np.diff(times)[:, None] * 0.5 * (residuals[1:] + residuals[:-1])
+        walk = np.median(np.diff(times)) * (times[-1] - times[0]) / (6.0 * self._weight)
+        return np.maximum(np.var(np.cumsum(steps, axis=0), axis=0) - walk, 0.0)
 
 
 @njit(cache=True)
@@ -105,9 +173,10 @@ def _add(
     imus,
     omega,
     weight,
+    shares,
     cauchy,
     bias_offset,
-    fits,
+    residuals,
 ):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
@@ -115,7 +184,6 @@ def _add(
     J, index, e, weights = np.zeros((3, 27)), np.empty(27, np.int64), np.empty(3), np.empty(3)
     size = H.shape[0] // 2
     cost, squared = 0.0, 0.0
-    means = np.zeros((fits.shape[0], 3))
     for m in range(times.shape[0]):
         n = nodes[m]
         gp.hermite(
@@ -132,14 +200,52 @@ def _add(
             J[i, 24 + i] = 1.0
         robust = 1.0 / (1.0 + u2 / (cauchy * cauchy))
         for i in range(3):
-            weights[i] = weight * robust
+            weights[i] = shares[imus[m]] * weight * robust
         gp.add_rows(H, g, index, e, J, weights)
-        fits[imus[m], 0] += 1.0
-        for i in range(3):
-            means[imus[m], i] += e[i]
-        cost += 0.5 * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
+        residuals[m] = e
+        cost += 0.5 * shares[imus[m]] * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
         squared += u2 * robust
-    for imu in range(fits.shape[0]):
-        mean2 = np.sum(means[imu] ** 2) / max(fits[imu, 0], 1.0) ** 2
-        fits[imu, 1] = fits[imu, 0] if mean2 * weight < FIT_SQUARED else 0.0
     return cost, squared
+
+
+@njit(cache=True)
+def _add_clocks(
+    gradient,
+    information,
+    coupling,
+    squared,
+    sensors,
+    T_a,
+    v_a,
+    T_b,
+    v_b,
+    bias,
+    dt,
+    times,
+    nodes,
+    imus,
+    omega,
+    bias_offset,
+):
+    """Add each sample's slope, information and coupling; the slope is the angular acceleration."""
+    W, V, M = lie_kernels.workspace()
+    J_work = np.empty((2, 6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    before, after, index = np.empty(6), np.empty(6), np.empty(24, np.int64)
+    for m in range(times.shape[0]):
+        n, s, imu = nodes[m], sensors[m], imus[m]
+        t0, t1 = max(times[m] - CLOCK_STEP, 0.0), min(times[m] + CLOCK_STEP, dt)
+        a, b = (T_a[n], v_a[n]), (T_b[n], v_b[n])
+        gp.hermite(a[0], a[1], b[0], b[1], dt, t0, T, before, J_pose, J_rate, W, V, M, J_work)
+        gp.hermite(a[0], a[1], b[0], b[1], dt, t1, T, after, J_pose, J_rate, W, V, M, J_work)
+        gp.hermite(a[0], a[1], b[0], b[1], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
+        gp.time_index(n, VELOCITY, coupling.shape[0] // 2, index)
+        for i in range(3, 6):
+            slope = (after[i] - before[i]) / (t1 - t0)
+            error = v[i] + bias[imu, i - 3] - omega[m, i - 3]
+            squared[s] += error * error
+            gradient[s] += slope * error
+            information[s] += slope * slope
+            coupling[bias_offset + 3 * imu + i - 3, s] += slope
+            for j in range(24):
+                coupling[index[j], s] += slope * J_rate[i, j]

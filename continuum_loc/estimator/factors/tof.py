@@ -15,6 +15,7 @@ from __future__ import annotations
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import (
+    ClockScores,
     Factor,
     FactorReport,
     known_sensor,
@@ -121,10 +122,15 @@ class TofFactor(Factor):
         )
         for one, hit, T in zip(kept, hits, poses, strict=True):
             one.hits, one.T_map_body = hit, T
-        return (times, *(np.array([row[i] for row in rows]) for i in range(5)), hits, poses)
+        sensors = np.array([row[0] for row in rows])
+        order = np.lexsort((times, sensors))
+        pairs = np.stack([order[:-1], order[1:]])  # of frames in a row of the same sensor
+        pairs = pairs[:, sensors[pairs[0]] == sensors[pairs[1]]]
+        arrays = (np.array([row[i] for row in rows]) for i in range(1, 5))
+        return times, sensors, *arrays, hits, poses, pairs
 
     def linearise(self, batch, a, b, blocks):
-        times, sensors, nodes, q, rays, variance, hits, poses = batch
+        times, sensors, nodes, q, rays, variance, hits, poses, _ = batch
         options = self.settings.tof
         weights = np.array([self.weights[self._names[s]] for s in sensors])
         fits = np.zeros((len(times), 2))
@@ -156,7 +162,51 @@ class TofFactor(Factor):
         by_sensor = np.zeros((len(self._names), 2))
         np.add.at(by_sensor, sensors, fits)
         heard = np.flatnonzero(np.bincount(sensors, minlength=len(self._names)))
-        return FactorReport(cost, squared, count, {self._names[s]: by_sensor[s] for s in heard})
+        fits = {self._names[s]: by_sensor[s] for s in heard}
+        return FactorReport(cost, squared, count, fits, flicker=self._flicker(batch))
+
+    def clock_scores(self, batch, a, b):
+        times, sensors, nodes, q, rays, variance, hits, _, _ = batch
+        options = self.settings.tof
+        weights = np.array([self.weights[self._names[s]] for s in sensors])
+        names, number = np.unique(sensors, return_inverse=True)
+        gradient, information = np.zeros(len(names)), np.zeros(len(names))
+        coupling = np.zeros((2 * self.grid.dim, len(names)))
+        _add_clocks(
+            gradient,
+            information,
+            coupling,
+            number,
+            a.T,
+            a.velocity,
+            b.T,
+            b.velocity,
+            b.time - a.time,
+            times,
+            nodes,
+            q,
+            rays,
+            variance,
+            weights,
+            *self.map_arrays[1:],
+            options.floor**2,
+            options.footprint * self._half_zone,
+            self.cauchy,
+            self.gate,
+            hits,
+        )
+        usual = np.ones(len(names))  # outliers the loss has taken care of
+        return ClockScores([self._names[s] for s in names], gradient, information, coupling, usual)
+
+    def _flicker(self, batch: tuple) -> dict[str, np.ndarray]:
+        """Count by sensor zones seen in two frames in a row, and those matched in just one."""
+        sensors, variance, hits, pairs = batch[1], batch[5], batch[6], batch[8]
+        usable, matched = np.isfinite(variance), hits >= 0
+        both = usable[pairs[0]] & usable[pairs[1]]
+        changed = both & (matched[pairs[0]] != matched[pairs[1]])
+        counts = np.zeros((len(self._names), 2))
+        np.add.at(counts, sensors[pairs[1]], np.stack([both.sum(1), changed.sum(1)], 1))
+        return {self._names[s]: counts[s] for s in np.flatnonzero(counts[:, 0])}
 
 
 class Association:
@@ -292,6 +342,72 @@ def _add(
         squared += frame_squared
         count += frame_count
     return cost, squared, count
+
+
+@njit(cache=True)
+def _add_clocks(
+    gradient,
+    information,
+    coupling,
+    sensors,
+    T_a,
+    v_a,
+    T_b,
+    v_b,
+    dt,
+    times,
+    nodes,
+    q,
+    rays,
+    variance,
+    weights,
+    cloud,
+    normals,
+    planarity,
+    map_variance,
+    floor2,
+    footprint,
+    cauchy,
+    gate,
+    hits,
+):
+    """Add each frame's v^T g, v^T H v and J^T H v to its sensor's, v the body's velocity then."""
+    W, V, M = lie_kernels.workspace()
+    J_work = np.empty((2, 6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    index, fit = np.empty(24, np.int64), np.empty(2)
+    H, g, Hv = np.empty((6, 6)), np.empty(6), np.empty(6)
+    for f in range(times.shape[0]):
+        n, s = nodes[f], sensors[f]
+        gp.hermite(
+            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work
+        )
+        frame_information(
+            T,
+            q[f],
+            rays[f],
+            variance[f],
+            hits[f],
+            weights[f],
+            cloud,
+            normals,
+            planarity,
+            map_variance,
+            floor2,
+            footprint,
+            cauchy,
+            gate,
+            H,
+            g,
+            fit,
+        )
+        lie_kernels.apply(H, v, Hv)
+        gp.time_index(n, VELOCITY, coupling.shape[0] // 2, index)
+        for i in range(6):
+            gradient[s] += g[i] * v[i]
+            information[s] += Hv[i] * v[i]
+            for j in range(24):
+                coupling[index[j], s] += J_pose[i, j] * Hv[i]
 
 
 @njit(cache=True)

@@ -1,0 +1,146 @@
+"""
+Sensor health: which sensors are not to be believed, and why.
+
+A sensor that is silent, whose clock is off, that does not fit where its kind does, or whose zones
+match the map in one frame and not in the next. A ToF sensor that does not fit may be broken, or
+the body be in a wrong place: the caller says when a search has ruled out the latter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from continuum_loc.estimator.clocks import ClockEvidence, ClockOffset
+from continuum_loc.estimator.factors import Factor
+from continuum_loc.estimator.settings import HealthSettings
+from continuum_loc.estimator.window import Window
+from continuum_loc.robot import RobotDescription
+import numpy as np
+
+HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt, not a sensor
+CONFIRMATIONS = 2  # tests in a row that must find a clock off
+STILL_SIGMAS = 3.0  # for a clock known to be off
+NOISY = 'noisy'
+
+
+class Health:
+    """
+    Watches over a robot's sensors.
+
+    reasons: why each suspect is one, by name. How much each sensor counts is told its factor.
+    """
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        window: Window,
+        factors: Sequence[Factor],
+        settings: HealthSettings,
+    ):
+        self.reasons: dict[str, str] = {}
+        self._robot, self._window, self._factors, self._settings = robot, window, factors, settings
+        self._weights = [factor.weights for factor in factors]
+        self._heard: dict[str, float] = {}
+        weighed = set().union(*self._weights)
+        self._tof_names = [sensor.name for sensor in robot.tof if sensor.name in weighed]
+        self._kinds = (self._tof_names, [sensor.name for sensor in robot.imu])
+        self._clock_groups = self._groups()
+        self._votes: dict[tuple[str, ...], int] = {}
+        self._late: dict[tuple[str, ...], ClockOffset] = {}
+        self._next_clocks = 0.0
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Names of the sensors that are suspect."""
+        return tuple(self.reasons)
+
+    @property
+    def disbelieved(self) -> set[str]:
+        """Suspects whose samples tell nothing of the body; noise alone the loss deals with."""
+        return {name for name, reason in self.reasons.items() if reason != NOISY}
+
+    def hear(self, sensor: str, time: float) -> None:
+        """Note that a sensor gave a usable sample at `time` [s]."""
+        self._heard[sensor] = max(time, self._heard.get(sensor, time))
+
+    def look(self, time: float, body_believed: bool) -> None:
+        """Judge every sensor; `body_believed` says that a search found no better body."""
+        reasons = dict.fromkeys(self._noisy(), NOISY)
+        for name in self._misfits():
+            if body_believed or name in self.disbelieved or name not in self._tof_names:
+                reasons[name] = 'does not fit'
+        self._look_at_clocks(time)
+        for clock in self._late.values():
+            reasons.update(dict.fromkeys(clock.sensors, _lateness(clock)))
+        reasons.update(dict.fromkeys(self._silent(time), 'silent'))
+        self.reasons = reasons
+        self._count()
+
+    def _misfits(self) -> list[str]:
+        """Sensors that do not fit while others of their kind do: a wrong mount, a broken part."""
+        shares, misfits = self._window.fit().shares, []
+        for kind in self._kinds:
+            names = [name for name in kind if name in shares]
+            healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
+            misfits += [
+                name for name in names if healthy and shares[name] < self._settings.sensor_share
+            ]
+        return misfits
+
+    def _noisy(self) -> list[str]:
+        """ToF sensors whose zones match the map in one frame and not in the next."""
+        flicker = self._window.flicker()
+        return [name for name, share in flicker.items() if share > self._settings.flicker_share]
+
+    def _silent(self, time: float) -> list[str]:
+        """Sensors without a usable sample for long while others of their kind speak."""
+        silent = []
+        for kind in self._kinds:
+            ages = {name: time - self._heard.get(name, 0.0) for name in kind}
+            if ages and min(ages.values()) < self._settings.silence:
+                silent += [name for name, age in ages.items() if age >= self._settings.silence]
+        return silent
+
+    def _groups(self) -> list[tuple[str, ...]]:
+        """Sensors that may share a clock: each alone, the ToF sensors of a ring, all of them."""
+        rings = {ring.name: [] for ring in self._robot.rings}
+        for sensor in self._robot.tof if self._tof_names else ():
+            rings[sensor.ring].append(sensor.name)
+        alone = [(name,) for kind in self._kinds for name in kind]
+        return list(
+            dict.fromkeys([*alone, *(tuple(m) for m in rings.values() if m), *self._all()])
+        )
+
+    def _all(self) -> list[tuple[str, ...]]:
+        return [tuple(self._tof_names)] if self._tof_names else []
+
+    def _look_at_clocks(self, time: float) -> None:
+        """Test the clocks now and then; an offset counts once it was found twice in a row."""
+        options = self._settings
+        if options.clock_period <= 0.0 or time < self._next_clocks:
+            return
+        self._next_clocks = time + options.clock_period
+        evidence = ClockEvidence.of(self._window, self._factors)
+        still = [evidence.outside(group, options.suspect_weight) for group in self._late]
+        late = {one.sensors: one for one in still if one.sigmas > STILL_SIGMAS}
+        struck = {name for group in late for name in group}
+        others = [group for group in self._clock_groups if not struck & set(group)]
+        found = evidence.offsets(others, options.clock_offset, options.clock_sigmas)
+        self._votes = {one.sensors: self._votes.get(one.sensors, 0) + 1 for one in found}
+        late |= {one.sensors: one for one in found if self._votes[one.sensors] >= CONFIRMATIONS}
+        self._late = late
+
+    def _count(self) -> None:
+        """Have disbelieved sensors count little, the measurements in the window included."""
+        doubted, changed = self.disbelieved, False
+        for weights in self._weights:
+            for name, before in weights.items():
+                weights[name] = self._settings.suspect_weight if name in doubted else 1.0
+                changed |= weights[name] != before
+        if changed:
+            self._window.mark_changed()
+
+
+def _lateness(clock: ClockOffset) -> str:
+    side = 'late' if clock.offset < 0.0 else 'early'
+    return f'{1e3 * abs(clock.offset):.0f} ms {side}'
