@@ -84,3 +84,13 @@ def test_an_unobserved_direction_is_said():
     intervals[0].H[0, :] = intervals[0].H[:, 0] = 0.0
     with pytest.raises(SingularError, match='column 0'):
         Chain(D, start).solve(intervals, 0)
+
+
+def test_quadratic_form_of_the_inverse_equals_dense_algebra():
+    start, intervals = random_chain(5)
+    chain = Chain(D, start)
+    chain.solve(intervals, 0)
+    C = np.random.default_rng(6).normal(size=(K, D, 3))
+    flat = C.reshape(K * D, 3)
+    expected = flat.T @ np.linalg.solve(dense(start, intervals)[0], flat)
+    np.testing.assert_allclose(chain.quadratic(C), expected, rtol=1e-9)

@@ -14,7 +14,7 @@ the chain keeps; sensors that share a clock are tested together by adding their 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.window import Window
@@ -77,8 +77,9 @@ class ClockEvidence:
             if best.sigmas < sigmas or abs(best.offset) < least:
                 break
             member = self._members(best.sensors)
-            if best.sigmas >= sigmas * np.sqrt(max(member @ self.spread / member.sum(), 1.0)):
-                found.append(best)
+            inflation = np.sqrt(max(member @ self.spread / member.sum(), 1.0))
+            if best.sigmas >= sigmas * inflation:
+                found.append(replace(best, sigma=best.sigma * inflation))
             coupled = information @ member
             g = g + coupled * best.offset
             information = information - np.outer(coupled, coupled) * best.sigma**2
@@ -118,7 +119,7 @@ def _sigmas(clock: ClockOffset) -> float:
 
 
 def _gather(window: Window, factors: Sequence[Factor]):
-    """Sum g, h (S,) and c (K, D, S) of all sensors over the window's intervals; mean spread (S,)."""
+    """Sum g, h (S,) and c (K, D, S) over the window by sensor, and the mean spread (S,)."""
     names: dict[str, int] = {}
     parts = []
     for k, interval in enumerate(window.intervals):

@@ -18,7 +18,9 @@ from continuum_loc.robot import RobotDescription
 import numpy as np
 
 HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt, not a sensor
-CONFIRMATIONS = 2  # tests in a row that must find a clock off
+CERTAIN = 2.0  # times the deviations asked for, and one test will do
+MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
+KNOWN_FOR = 1.0  # [s] that what was found of the clocks holds without another test
 STILL_SIGMAS = 3.0  # for a clock known to be off
 NOISY = 'noisy'
 
@@ -47,7 +49,7 @@ class Health:
         self._clock_groups = self._groups()
         self._votes: dict[tuple[str, ...], int] = {}
         self._late: dict[tuple[str, ...], ClockOffset] = {}
-        self._next_clocks = 0.0
+        self._next_clocks = self._clocks_known = 0.0
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -115,20 +117,41 @@ class Health:
         return [tuple(self._tof_names)] if self._tof_names else []
 
     def _look_at_clocks(self, time: float) -> None:
-        """Test the clocks now and then; an offset counts once it was found twice in a row."""
-        options = self._settings
-        if options.clock_period <= 0.0 or time < self._next_clocks:
+        """Test the clocks now and then."""
+        if self._settings.clock_period <= 0.0 or time < self._next_clocks:
             return
-        self._next_clocks = time + options.clock_period
+        self._next_clocks = time + self._settings.clock_period
         evidence = ClockEvidence.of(self._window, self._factors)
-        still = [evidence.outside(group, options.suspect_weight) for group in self._late]
-        late = {one.sensors: one for one in still if one.sigmas > STILL_SIGMAS}
-        struck = {name for group in late for name in group}
+        if np.max(evidence.spread, initial=0.0) <= MOST_SPREAD:
+            self._clocks_known = time
+            still = self._still_off(evidence)
+            self._late = still | self._newly_off(evidence, still)
+        elif time - self._clocks_known > KNOWN_FOR:
+            self._late = {}  # a body that rattles says nothing of clocks
+
+    def _still_off(self, evidence: ClockEvidence) -> dict[tuple[str, ...], ClockOffset]:
+        """Look again at the clocks that were off: others say where the body is."""
+        again = [evidence.outside(group, self._settings.suspect_weight) for group in self._late]
+        least = 0.5 * self._settings.clock_offset
+        return {
+            one.sensors: one
+            for one in again
+            if one.sigmas > STILL_SIGMAS and abs(one.offset) > least
+        }
+
+    def _newly_off(
+        self, evidence: ClockEvidence, known: dict[tuple[str, ...], ClockOffset]
+    ) -> dict[tuple[str, ...], ClockOffset]:
+        """Find more clocks that are off: very certainly, or twice in a row."""
+        options, struck = self._settings, {name for group in known for name in group}
         others = [group for group in self._clock_groups if not struck & set(group)]
         found = evidence.offsets(others, options.clock_offset, options.clock_sigmas)
-        self._votes = {one.sensors: self._votes.get(one.sensors, 0) + 1 for one in found}
-        late |= {one.sensors: one for one in found if self._votes[one.sensors] >= CONFIRMATIONS}
-        self._late = late
+        votes = {}
+        for one in found:
+            certain = one.sigmas >= CERTAIN * options.clock_sigmas
+            votes[one.sensors] = self._votes.get(one.sensors, 0) + (2 if certain else 1)
+        self._votes = votes
+        return {one.sensors: one for one in found if votes[one.sensors] >= 2}
 
     def _count(self) -> None:
         """Have disbelieved sensors count little, the measurements in the window included."""

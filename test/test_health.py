@@ -1,0 +1,99 @@
+"""Sensor health: what clocks and zones tell, and who is blamed in an analytic world."""
+
+from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
+from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.state import Grid
+from continuum_loc.measurements import TruthSample
+from continuum_loc.settings import parse_settings
+from continuum_loc.simulator.faults import ClockOffset, Outliers
+import numpy as np
+import pytest
+from test_factors import columns, DT, make_factor, measurements, robot
+from worlds import Rod, rod, room_map, stream
+
+STEP = 1e-5  # [s]
+
+
+@pytest.mark.parametrize('kind', ['tof', 'gyro'])
+@pytest.mark.parametrize('seed', range(2))
+def test_clock_scores_are_derivatives_by_the_stamps(kind, seed):
+    """
+    Moving a sensor's stamps changes the cost as its score says.
+
+    The coupling is how that slope changes with the state: the mixed second derivative in the
+    Gauss-Newton sense, which along the motion itself is the slope of the gradient.
+    """
+    description = robot()
+    grid = Grid(description, 0.16)
+    factor = make_factor(kind, description, grid)
+    rows = [factor.row(m) for m in measurements(kind, description)]
+    times = np.linspace(0.2, 0.8, len(rows)) * DT
+    a, b = columns(grid, seed)
+    batch = factor.stack(times, rows)
+    factor.linearise(batch, a, b, Blocks.zeros(grid.dim))
+    scores = factor.clock_scores(batch, a, b)
+    which = batch[1]
+    for number, name in enumerate(scores.sensors):
+        moved = which == list(factor.weights).index(name)
+        cost = [
+            factor.linearise(
+                (batch[0] + sign * STEP * moved, *batch[1:]), a, b, Blocks.zeros(grid.dim)
+            ).squared
+            for sign in (1.0, -1.0)
+        ]
+        slope = (cost[0] - cost[1]) / (4.0 * STEP)
+        assert slope == pytest.approx(scores.gradient[number], rel=2e-3, abs=1e-6)
+        assert scores.information[number] > 0.0
+
+
+def blamed(fault=None, seed=3, duration=5.0):
+    """Sensors that a filter blames at any time, and its largest error [m]."""
+    settings = parse_settings(
+        EstimatorSettings, {'knot_period': 0.1, 'window': 1.0, 'health': {'clock_period': 0.2}}
+    )
+    filter_ = SlidingWindowFilter(rod(), room_map(), settings)
+    reasons: dict[str, str] = {}
+    samples = stream(Rod(rod(), seed=seed), duration)
+    truth, error = {}, 0.0
+    for sample in fault(samples) if fault else samples:
+        if isinstance(sample, TruthSample):
+            truth[sample.stamp] = sample.T_map_ring
+            continue
+        estimate = filter_.process(sample)
+        if estimate is not None:
+            reasons |= estimate.suspects
+            if estimate.stamp in truth:
+                off = estimate.T_map_ring[:, :3, 3] - truth[estimate.stamp][:, :3, 3]
+                error = max(error, float(np.linalg.norm(off, axis=1).max()))
+    return reasons, error
+
+
+def test_nobody_is_blamed_for_nothing():
+    reasons, _ = blamed()
+    assert reasons == {}
+
+
+def test_a_late_ring_is_named_and_by_how_much():
+    """A ring's ToF frames 60 ms late: its sensors are named, no other, and about how late."""
+    late = ClockOffset(sensors=('r2_tof*',), start=2.0, offset=0.06)
+    reasons, error = blamed(late)
+    assert {'r2_tof0', 'r2_tof1', 'r2_tof2'} == {name for name in reasons}
+    assert all(reason.endswith('ms late') for reason in reasons.values())
+    told = [float(reason.split()[0]) for reason in reasons.values()]
+    assert 20.0 < min(told) <= max(told) < 80.0
+    assert np.mean(told) == pytest.approx(60.0, rel=0.4)
+    assert error < 0.03
+
+
+def test_a_late_gyro_is_told_from_tof_that_is_early():
+    reasons, _ = blamed(ClockOffset(sensors=('r2_imu',), start=2.0, offset=0.06))
+    assert set(reasons) == {'r2_imu'}
+    assert reasons['r2_imu'].endswith('ms late')
+
+
+def test_a_noisy_sensor_is_named():
+    """Outliers change from frame to frame; something new in the scene does not."""
+    noisy = Outliers(sensors=('r1_tof1',), start=2.0, probability=0.3)
+    reasons, error = blamed(noisy)
+    assert reasons == {'r1_tof1': 'noisy'}
+    assert error < 0.01
