@@ -1,9 +1,13 @@
 """Sensor health: what clocks and zones tell, and who is blamed in an analytic world."""
 
+from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
 from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.output import rattle_covariance
 from continuum_loc.estimator.state import Grid
+from continuum_loc.evaluation.trials import _base_drawn
 from continuum_loc.measurements import TruthSample
+from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.faults import ClockOffset, Outliers
 import numpy as np
@@ -77,7 +81,7 @@ def test_a_late_ring_is_named_and_by_how_much():
     """A ring's ToF frames 60 ms late: its sensors are named, no other, and about how late."""
     late = ClockOffset(sensors=('r2_tof*',), start=2.0, offset=0.06)
     reasons, error = blamed(late)
-    assert {'r2_tof0', 'r2_tof1', 'r2_tof2'} == {name for name in reasons}
+    assert set(reasons) == {'r2_tof0', 'r2_tof1', 'r2_tof2'}
     assert all(reason.endswith('ms late') for reason in reasons.values())
     told = [float(reason.split()[0]) for reason in reasons.values()]
     assert 20.0 < min(told) <= max(told) < 80.0
@@ -97,3 +101,57 @@ def test_a_noisy_sensor_is_named():
     reasons, error = blamed(noisy)
     assert reasons == {'r1_tof1': 'noisy'}
     assert error < 0.01
+
+
+def test_rattle_is_the_angle_that_residual_rates_integrate_to():
+    """Residuals A sin(w t) turn the body by A / w, with variance A^2 / (2 w^2)."""
+    description = robot()
+    factor = make_factor('gyro', description, Grid(description, 0.16))
+    times = np.arange(0.0, 1.0, 0.005)
+    rng, sigma = np.random.default_rng(0), factor._weight**-0.5
+    omega, amplitude = 2.0 * np.pi * 9.0, 60.0 * sigma
+    noise = sigma * rng.normal(size=(len(times), 3))
+    swing = amplitude * np.sin(omega * times)[:, None] * [0.0, 1.0, 0.5]
+    variance = factor._rattle(times, swing + noise)
+    assert variance[1] == pytest.approx(amplitude**2 / (2.0 * omega**2), rel=0.1)
+    assert variance[2] == pytest.approx(variance[1] / 4.0, rel=0.2)
+    walks = [factor._rattle(times, sigma * rng.normal(size=(len(times), 3))) for _ in range(50)]
+    assert np.mean(walks) < 0.02 * variance[2]
+
+
+def test_turns_move_what_is_beyond_them_sideways():
+    """A body that turns by 1 mrad about z everywhere beyond s = 0.1 m moves along y as it does."""
+    turns = np.tile([0.0, 0.0, 1e-3], (2, 1))
+    P = rattle_covariance(np.array([0.1, 0.6]), turns, np.array([0.0, 0.1, 0.6]))
+    np.testing.assert_allclose(np.sqrt(P[:, 5, 5]), [0.0, 1e-3, 1e-3])
+    np.testing.assert_allclose(np.sqrt(P[:, 1, 1]), [0.0, 0.5e-4, 5.5e-4])
+    assert np.all(P[:, 2, 2] == 0.0)
+
+
+def test_strain_may_step_where_a_module_ends():
+    """The rod's curvature steps at 0.3 m: told so, strain alone leads to its tip more closely."""
+    off = []
+    for ends in ((), (0.3,)):
+        data = rod(tof=False).model_dump()
+        data['backbone']['module_ends'] = ends
+        data['imu'] = []
+        description = parse_settings(RobotDescription, data)
+        filter_ = SlidingWindowFilter(description, None, EstimatorSettings(knot_period=0.1))
+        truth, errors = {}, []
+        for sample in stream(Rod(description, seed=4, amplitude=3.0), 3.0):
+            if isinstance(sample, TruthSample):
+                truth[sample.stamp] = sample.T_map_ring
+            elif (estimate := filter_.process(sample)) and estimate.stamp in truth:
+                gap = estimate.T_map_ring[-1, :3, 3] - truth[estimate.stamp][-1, :3, 3]
+                errors.append(np.linalg.norm(gap))
+        off.append(np.mean(errors[5:]))
+    assert off[1] < 0.5 * off[0]
+
+
+def test_a_drawn_base_keeps_the_spread_of_the_description():
+    description = robot()
+    base, sigma = description.base, description.base.sigma_position
+    moved = np.array([_base_drawn(description, seed).base.T_map_base for seed in range(300)])
+    shift = (lie.inverse(base.T_map_base) @ moved)[:, :3, 3]
+    np.testing.assert_allclose(shift.std(axis=0), sigma, rtol=0.15)
+    np.testing.assert_array_equal(moved[7], _base_drawn(description, 7).base.T_map_base)
