@@ -6,6 +6,11 @@ Every sensor agrees with the truth, and seeds decide everything.
 
 from collections import Counter, defaultdict
 import dataclasses
+import hashlib
+import os
+from pathlib import Path
+import subprocess
+import sys
 
 from continuum_loc import lie
 from continuum_loc.measurements import (
@@ -293,6 +298,39 @@ def test_the_same_seed_gives_the_same_samples_to_the_bit(scene):
         )
 
 
+def test_another_process_makes_the_same_samples_to_the_bit():
+    """A process of its own, with other hash seeds and another number of threads."""
+    code = (
+        'import sys; sys.path.insert(0, sys.argv[1]); import test_world; '
+        'print(test_world.digest_of_a_run())'
+    )
+    digests = {
+        subprocess.run(
+            [sys.executable, '-c', code, str(Path(__file__).parent)],
+            env=os.environ | {'PYTHONHASHSEED': seed, 'OMP_NUM_THREADS': threads},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for seed, threads in (('1', '1'), ('2', '4'))
+    }
+    assert digests == {f'{digest_of_a_run()}\n'}
+
+
+def digest_of_a_run() -> str:
+    """SHA-256 of every array and number of a short run with all sensors of the box scene."""
+    from continuum_loc.simulator.scenes import load_scene
+
+    digest = hashlib.sha256()
+    arm = load_robot('soft_arm')
+    for sample in World(arm, load_scene('R4'), 'b2', tof_fidelity='vl53l5cx', seed=5).run(0.3):
+        for value in arrays(sample):
+            digest.update(
+                value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            )
+    return digest.hexdigest()
+
+
 def test_another_seed_changes_every_noisy_sample_and_no_truth(scene):
     robot = load_robot('engine')
     a, b = (list(World(robot, scene, 't1', seed=seed).run(0.3)) for seed in (3, 4))
@@ -504,6 +542,20 @@ def test_contacts_hold_the_body_out_of_the_scene(robot):
     assert max(inside) < 0.005
     if robot == 'engine':
         assert max(inside) > -0.002  # the trajectory does lean on the blades
+
+
+@pytest.mark.parametrize(
+    ('scene', 'path', 'until'), [('R1', 'b6', 8.5), ('R2', 'b7', 6.5), ('R3', 'b8', 8.1)]
+)
+def test_the_soft_arm_touches_what_stands_in_the_box(scene, path, until):
+    from continuum_loc.simulator.scenes import load_scene
+
+    arm = load_robot('soft_arm').model_copy(update={'tof': (), 'imu': ()})
+    world = World(arm, load_scene(scene), path)
+    depth = [world.body.penetration() for _ in world.run(until)]
+    assert 0.0 < max(depth) < 0.01  # a tap at a metre a second, held by a rigid object
+    empty = World(arm, load_scene('R0'), path)
+    assert not any(empty.body.penetration() for _ in empty.run(until))
 
 
 # --------------------------------------------------------------------------- bad input
