@@ -304,7 +304,7 @@ def test_precision_and_recall_count_kind_and_place(changed_room):
 
 
 def test_fused_surfels_are_nearer_to_the_surface_than_points_and_say_how_near():
-    """Ranges err by 0.4 to 0.9 cm here; averaging over the surfels' beams leaves less than half of that."""
+    """Averaging over the beams of a surfel leaves less than half of a range's error."""
     trajectory, mesh = swaying(), room(COMMON)
     cloud = reconstruct(ROBOT, measured(trajectory, mesh, seed=8), trajectory)
     scene = fuse(cloud)

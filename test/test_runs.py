@@ -124,7 +124,7 @@ def test_a_run_folder_gives_back_what_went_in(result, tmp_path):
 
 
 def test_evo_ape_finds_the_figures_of_the_summary_in_the_exported_trajectories(result, tmp_path):
-    """Truth comes at another rate than the estimates, between them, and the first are not judged."""
+    """Truth comes at another rate than the estimates, and the first are not judged."""
     shifted = replace(result.truth, stamps=result.truth.stamps + 3 * NANOSECONDS // 1000)
     summary = save_run(
         tmp_path, replace(result, truth=shifted), kind='replay', seed=0, configuration={}

@@ -218,7 +218,7 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
 
 
 def _complete(summary: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The summary, with the figures that were not yet computed when its run was made."""
+    """Return the summary with the figures that were not computed yet when its run was made."""
     from continuum_loc.evaluation.runs import load_run, summary_of
 
     if 'silent_seconds' in summary:

@@ -144,7 +144,11 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
 
 
 def silent_seconds(judged: Track, found: Errors) -> float:
-    """Return the longest time [s] for which a ring was off by more than LOST_ERROR and the filter did not say lost."""
+    """
+    Return the longest time [s] for which a ring was off and the filter did not say lost.
+
+    Off: by more than LOST_ERROR.
+    """
     off = found.translation_m[:, 1:].max(axis=1, initial=0.0) > LOST_ERROR
     if judged.status is not None:
         off &= ~np.isin(found.stamps, judged.stamps[judged.status == 'lost'])

@@ -58,7 +58,7 @@ def require_unseen(trials: list[Trial]) -> None:
 
 
 def require_new_scenes(scenes: Iterable[str]) -> None:
-    """Raise SplitError when a claim on anomalies would rest on a scene that the detector was tuned on."""
+    """Raise SplitError when a claim would rest on a scene that the detector was tuned on."""
     seen = sorted(set(scenes) & set(DETECTOR_HOLD_OUT))
     if seen:
         raise SplitError(f'the detector was tuned on {", ".join(seen)}: no claim may rest on it')

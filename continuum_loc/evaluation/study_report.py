@@ -122,7 +122,7 @@ def worst_part(ranked: Sequence[Outcome]) -> Part:
 
 
 def unbroken(value: Any) -> str:
-    """The cell of a value; a mean and its deviation, a map and its scene stay on one line."""
+    """Write a cell so that a mean and its deviation, a map and its scene stay on one line."""
     return str(value).replace(' ± ', '\u00a0±\u00a0').replace(' - ', '\u00a0-\u00a0')
 
 

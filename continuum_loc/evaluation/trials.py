@@ -164,7 +164,7 @@ def make_filter(
 
 
 def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:
-    """The prior map of a scene, sampled from its mesh once and kept on disk."""
+    """Return the prior map of a scene, sampled from its mesh once and kept on disk."""
     from continuum_loc.mapping.map_files import load_map
 
     return load_map(scene_map_file(scene_name, points, seed))

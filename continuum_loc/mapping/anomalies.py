@@ -56,7 +56,7 @@ class AnomalySettings(Settings):
     stray_share: float = Field(
         0.35,
         ge=0.0,
-        description='new points in a cell, as a share of the beams that saw through it, below which they are stray',
+        description='share of the beams through a cell below which new points in it are stray',
     )
     search_radius: float = Field(
         0.3, gt=0.0, description='a point with no map within this is new outright [m]'
@@ -128,8 +128,10 @@ class Evidence(NamedTuple):
 
 class Beams(NamedTuple):
     """
-    All beams of a reconstruction, those that met nothing last: origins (B, 3), unit directions (B,
-    3), lengths (B,) [m], their standard deviation along the beam (B,) [m], and stamps (B,).
+    All beams of a reconstruction, those that met nothing last.
+
+    origins: (B, 3) [m]; directions: (B, 3) unit; lengths: (B,) [m]; sigma: (B,) [m] standard
+    deviation along the beam, 0 without a return; stamps: (B,).
     """
 
     origins: np.ndarray
@@ -140,7 +142,7 @@ class Beams(NamedTuple):
 
     @classmethod
     def of(cls, reconstruction: Reconstruction) -> Beams:
-        """The beams to every point, and those without a return as far as the sensor reaches."""
+        """Take the beams to every point, and those without a return as far as sensors reach."""
         r = reconstruction
         origins = np.concatenate([r.origins, r.open_origins])
         along = np.concatenate([r.points, r.open_ends]) - origins
@@ -183,7 +185,7 @@ def new_evidence(
     behind: np.ndarray | None = None,
 ) -> Evidence:
     """
-    Every measured point: does it lie off the map (eq. 12), and before it?
+    Judge every measured point by whether it lies off the map (eq. 12), and before it.
 
     What lies `behind` the map (N,), on the beam, is no new thing: the range erred, or something
     missing has laid it open.
@@ -222,7 +224,7 @@ def missing_evidence(
     beams: Beams, prior: PriorMap, settings: AnomalySettings, index: VoxelIndex
 ) -> Evidence:
     """
-    Every mapped surface that a beam should have met first: did the beam go through it?
+    Judge every mapped surface that a beam should have met first: did the beam go through it.
 
     A beam that ends in front of the mapped surface says nothing about it. One without a return
     went its whole length.
@@ -243,7 +245,11 @@ def missing_evidence(
 
 
 def behind_map(beams: Beams, prior: PriorMap, index: VoxelIndex, count: int) -> np.ndarray:
-    """Whether the map lies before the end of each of the first `count` beams, its discs without gaps."""
+    """
+    Whether the map lies before the end of each of the first `count` beams.
+
+    The map's discs are taken so large that they leave no gaps.
+    """
     first = slice(None, count)
     row, depth = first_crossings(
         prior, index, beams.origins[first], beams.directions[first], beams.lengths[first]

@@ -68,7 +68,7 @@ class FusedScene:
         return np.sqrt(np.einsum('gi,gij,gj->g', self.normals, self.covariance, self.normals))
 
     def save(self, path: str | Path) -> None:
-        """Write a `.ply` with x, y, z, the normal, sigma along it, the covariance and the beams."""
+        """Write a `.ply` with x, y, z, normal, sigma along it, covariance and beams."""
         if Path(path).suffix.lower() != '.ply':
             raise MapError(f'{path}: a scene is written as .ply')
         rows, columns = UPPER
@@ -113,10 +113,11 @@ def fuse(reconstruction: Reconstruction, settings: FusionSettings | None = None)
 
 class _Groups(NamedTuple):
     """
-    G groups of points, each of one cell and side: weight (G,), the sum of 1 / variance of the
-    ranges; weighted mean (G, 3) and scatter (G, 3, 3) of the points; toward (G, 3), the mean
-    direction back along the beams; pose (G, 3, 3), the mean of the poses' share of the covariance;
-    beams (G,), how many.
+    G groups of points, each of one cell and side.
+
+    weight: (G,) sum of 1 / variance of the ranges; mean, scatter: (G, 3) [m], (G, 3, 3) [m^2] of
+    the points so weighted; toward: (G, 3) mean direction back along the beams; pose: (G, 3, 3)
+    [m^2] mean of the poses' share of the covariance; beams: (G,) how many.
     """
 
     weight: np.ndarray
@@ -157,7 +158,7 @@ class _Groups(NamedTuple):
 
 
 def _keys(points: np.ndarray, directions: np.ndarray, cell: float) -> np.ndarray:
-    """Number (N,) each cell and side; the side is the direction's greatest component."""
+    """Return a key (N,) of cell and side; the side is the direction's greatest component."""
     cells = np.floor(points / cell).astype(np.int64)
     cells -= cells.min(axis=0)
     axis = np.argmax(np.abs(directions), axis=1)
@@ -167,7 +168,7 @@ def _keys(points: np.ndarray, directions: np.ndarray, cell: float) -> np.ndarray
 
 
 def _fit(groups: _Groups, tree: cKDTree, rows: slice, settings: FusionSettings):
-    """Surfels of some groups: points (g, 3), normals (g, 3), variance along them (g,), beams (g,)."""
+    """Fit surfels of some groups: points, normals (g, 3), variance along them, beams (g,)."""
     own, toward = groups.mean[rows], groups.toward[rows]
     distance, near = tree.query(own, k=settings.neighbours, distance_upper_bound=settings.radius)
     absent = near == len(groups.weight)

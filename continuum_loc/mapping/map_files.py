@@ -24,8 +24,9 @@ def load_map(
     seed: int = 0,
 ) -> PriorMap:
     """
-    A prior map from a file: `.npz`, `.ply`, `.pcd`, `.xyz`, `.csv`, or a mesh (`.stl`, `.obj`,
-    `.ply` with faces).
+    Load a prior map from a file.
+
+    `.npz`, `.ply`, `.pcd`, `.xyz`, `.csv`, or a mesh (`.stl`, `.obj`, `.ply` with faces).
 
     sigma: standard deviation of a point [m], where the file states none (default 0.1 mm, the
     paper's scanner).
@@ -92,7 +93,11 @@ def _valid_columns() -> str:
 
 
 def _check_csv_header(path: Path) -> int:
-    """Number of header lines (0 or 1). A header must name the columns in order."""
+    """
+    Count header lines (0 or 1).
+
+    A header must name the columns in order.
+    """
     with path.open(errors='replace') as stream:
         names = [name.strip().lower() for name in stream.readline().split(',')]
     if tuple(names) in {CLOUD_COLUMNS[:count] for count in COLUMN_COUNTS}:
@@ -107,7 +112,11 @@ def _check_csv_header(path: Path) -> int:
 
 
 def _first_bad_line(path: Path, skipped: int, comma: bool) -> str | None:
-    """Which line of a table cannot be used, and how many are like it. Only read after a failure."""
+    """
+    Which line of a table cannot be used, and how many are like it.
+
+    Only read after a failure.
+    """
     width, first, count = None, None, 0
     with path.open(errors='replace') as stream:
         for number, line in enumerate(stream, start=1):

@@ -91,7 +91,11 @@ class PriorMap:
 
 
 def by_suffix(path: Path, table: dict[str, Callable], verb: str) -> Callable:
-    """What `table` has for the ending of `path`. Raises MapError listing the valid ones."""
+    """
+    Choose from `table` by the ending of `path`.
+
+    Raises MapError listing the valid ones.
+    """
     if path.suffix.lower() not in table:
         raise MapError(
             f"{path}: a map cannot be {verb} as '{path.suffix}'; valid are {', '.join(table)}"

@@ -88,7 +88,7 @@ class Reconstruction:
     N measured surface points in `map`, and M beams that met nothing.
 
     points, origins: (N, 3) [m], where the beam ended and began; covariance: (N, 3, 3) [m^2] of
-    `points`; range_sigma: (N,) [m] the share of it that lies along the beam and is the range's own.
+    `points`; range_sigma: (N,) [m] its share along the beam that is the range's own.
     stamps: (N,) ns; sensors: names; sensor: (N,) number of the sensor in `sensors`.
     open_origins, open_ends: (M, 3) [m] of beams without a return, ending at the sensor's greatest
     range.

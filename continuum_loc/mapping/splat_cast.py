@@ -97,8 +97,10 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
 @njit(cache=True)
 def start_march(origin, direction, corner, edge):
     """
-    State of a march through cells of `edge` [m] counted from `corner` (Amanatides and Woo, 1987):
-    the first cell, the step per axis, how far along the ray its next side is, and how far apart.
+    Start a march through cells of `edge` [m] counted from `corner` (Amanatides and Woo, 1987).
+
+    Returns its state: the cell, the step per axis, how far along the ray the cell's next side is,
+    and how far apart such sides are.
     """
     at, step = np.empty(3, np.int64), np.empty(3, np.int64)
     until, stride = np.empty(3), np.empty(3)
@@ -115,7 +117,7 @@ def start_march(origin, direction, corner, edge):
 
 @njit(cache=True)
 def next_cell(at, step, until, stride):
-    """Move a march (`start_march`) to its next cell, and return how far along the ray that begins."""
+    """Move a march (`start_march`) to its next cell; return how far along the ray it begins."""
     axis = int(np.argmin(until))
     entered = until[axis]
     until[axis] += stride[axis]

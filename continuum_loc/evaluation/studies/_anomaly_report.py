@@ -1,4 +1,4 @@
-"""The report of the anomalies study: claims, tables, precision and recall, and each scene in 3-D."""
+"""The report of the anomalies study: claims, tables, precision and recall, scenes in 3-D."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def write_anomaly_report(
     tables: dict[str, list[dict[str, Any]]],
     results: Sequence[SceneResult],
 ) -> Path:
-    """Write the page. The scene with most that was missed or imagined comes first."""
+    """Write the page; the scenes with most anomalies to be found come first."""
     ranked = sorted(results, key=lambda one: -len(one.truth))
     groups = [
         [claims_part(claims)],
         [
             Part(
                 'Scenes',
-                'Distances to the true mesh. The paper reports 0.8, 1.2 and 1.4 cm for three of its '
-                'real scenes.',
+                'Distances to the true mesh. The paper reports 0.8, 1.2 and 1.4 cm for three '
+                'of its real scenes.',
                 table=as_table(rounded(tables['reconstruction'])),
             )
         ],
@@ -52,7 +52,7 @@ def write_anomaly_report(
             [
                 Part(
                     f'Scene {result.scene}',
-                    'Surfels coloured by depth; red: new, blue: missing. Outlined: what truly differs.',
+                    'Coloured by depth; red: new, blue: missing. Outlined: what truly differs.',
                     figure=chart(scene_figure(result)),
                 )
             ]
@@ -72,7 +72,7 @@ def write_anomaly_report(
 
 
 def rounded(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with numbers as one reads them."""
+    """Return the rows with numbers as one reads them."""
     return [
         {key: f'{value:.3g}' if isinstance(value, float) else value for key, value in row.items()}
         for row in rows
@@ -97,7 +97,7 @@ def curve_figure(curve: Sequence[dict[str, Any]]) -> go.Figure:
 
 
 def scene_figure(result: SceneResult) -> go.Figure:
-    """The fused scene, the clusters found in it, and the outlines of what truly differs."""
+    """Draw the fused scene, the clusters found in it, and outlines of what truly differs."""
     import plotly.graph_objects as go
 
     x, y, z = result.fused.astype(np.float32).T
@@ -139,7 +139,7 @@ def scene_figure(result: SceneResult) -> go.Figure:
 
 
 def _outline(vertices: np.ndarray, colour: str) -> go.Scatter3d:
-    """The edges of a bounding box of vertices (V, 3)."""
+    """Draw the edges of the bounding box of vertices (V, 3)."""
     import plotly.graph_objects as go
 
     low, high = vertices.min(axis=0) - 0.01, vertices.max(axis=0) + 0.01

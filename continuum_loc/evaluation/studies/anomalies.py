@@ -76,7 +76,11 @@ class SceneResult:
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Localise as for Table II (trials in `out` are not run again), then reconstruct each scene from its trials."""
+    """
+    Localise as for Table II, then reconstruct each scene from its trials.
+
+    Trials that are in `out` already are not run again.
+    """
     return run_scenes(out, out / 'anomalies', trials(quick, seed), seed, jobs)
 
 
@@ -126,7 +130,7 @@ def run_scenes(
 
 
 def judge_scene(out: Path, folder: Path, scene_name: str, members: list[Trial]) -> SceneResult:
-    """Reconstruct from the smoothed trajectories of a scene's trials, and detect what differs from the prior map."""
+    """Reconstruct from the smoothed trajectories, and detect what differs from the prior map."""
     scene = load_scene(scene_name)
     estimated, true = (
         joined([reconstruction_of(out, trial, i, track) for i, trial in enumerate(members)])
@@ -192,7 +196,7 @@ def pooled_curve(results: list[SceneResult]) -> list[dict[str, Any]]:
     """Precision and recall over all scenes at each threshold of confidence."""
     curves = [precision_recall(result.clusters, result.truth, THRESHOLDS) for result in results]
     kept, correct, found = (
-        np.sum([getattr(curve, name) for curve in curves], axis=0)
+        np.reshape([getattr(curve, name) for curve in curves], (-1, len(THRESHOLDS))).sum(axis=0)
         for name in ('kept', 'correct', 'found')
     )
     truths = sum(curve.truths for curve in curves)

@@ -12,7 +12,7 @@ from continuum_loc.evaluation.trials import Trial
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """The `anomalies` study on the hold-out (`quick`: six seconds of one trajectory in one scene)."""
+    """Run the `anomalies` study on the hold-out (`quick`: six seconds in one scene)."""
     members = [
         Trial('engine', scene, trajectory, 'S0', profile='full', seed=seed)
         for scene in DETECTOR_HOLD_OUT

@@ -91,14 +91,14 @@ def of_fidelity(outcomes: list[Outcome], fidelity: str) -> list[Outcome]:
 
 
 def judged(outcomes: list[Outcome]) -> list[Outcome]:
-    """The trials that claims may rest on: all but the hold-out that the filter was tuned on."""
+    """Select what claims may rest on: all but the hold-out that the filter was tuned on."""
     unseen = [outcome for outcome in outcomes if not is_hold_out(outcome.trial)]
     require_unseen([outcome.trial for outcome in unseen])
     return unseen
 
 
 def judge(outcomes: list[Outcome]) -> list[Claim]:
-    """The bounds, without the hold-out that the filter was tuned on."""
+    """Judge the bounds, without the hold-out that the filter was tuned on."""
     claims = []
     for fidelity, (translation, rotation) in LIMITS.items():
         rows: dict[tuple[str, str], list[Outcome]] = {}
@@ -153,5 +153,5 @@ def _against_matching(fidelity: str, rows: dict[tuple[str, str], list[Outcome]])
 
 
 def silently_lost(outcome: Outcome) -> bool:
-    """Whether a ring was off by more than 5 cm for over a second on end and the filter did not say lost."""
+    """Whether a ring was 5 cm off for over a second on end and the filter did not say lost."""
     return outcome.summary is not None and outcome.summary['silent_seconds'] > SILENT_LIMIT

@@ -27,7 +27,11 @@ PAPER = (
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """The trials of Table III (those in `out` already are not run again), by ring; written to `out/table4`."""
+    """
+    Judge the trials of Table III by ring, and write the results to `out/table4`.
+
+    Trials that are in `out` already are not run again.
+    """
     outcomes = run_campaign(soft_arm_trials(quick, seed), out, jobs)
     folder = out / 'table4'
     claims, tables = [], {}
