@@ -188,7 +188,7 @@ def replay(
     from continuum_loc.evaluation.replay import samples_of
     from continuum_loc.evaluation.runs import new_run, save_run
     from continuum_loc.evaluation.trials import make_filter, scene_map_file
-    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.mapping.map_files import load_map
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
@@ -499,7 +499,7 @@ def map_convert(
 
     Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1`
     """
-    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.mapping.map_files import load_map
 
     prior = load_map(source, viewpoint=viewpoint)
     prior.save(out)
@@ -513,7 +513,7 @@ def map_info(file: Annotated[Path, typer.Argument(help='map file')]) -> None:
 
     Example: `continuum-loc map info map.npz`
     """
-    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.mapping.map_files import load_map
 
     _describe_map(file, load_map(file))
 

@@ -6,6 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from continuum_loc.measurements import (
+    EncoderSample,
+    FieldSample,
+    ImuSample,
+    StrainSample,
+    TofFrame,
+    TrackedPose,
+    TruthSample,
+)
 from msg_tools import convert
 from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
@@ -130,6 +139,25 @@ OUTPUTS = (
     'shape/curve',
     '/diagnostics',
 )
+
+# What a sample goes out on; a TrackedPose on `tracker/<sensor>`.
+_SAMPLE_TOPICS = {
+    TofFrame: 'tof/points',
+    ImuSample: 'imu/data_raw',
+    FieldSample: 'imu/mag',
+    StrainSample: 'strain',
+    EncoderSample: 'joint_states',
+    TruthSample: 'ground_truth/poses',
+}
+
+
+def topic_of(sample: Any) -> str:
+    """Name the topic that carries a sample. Raises ConvertError for what is none."""
+    if isinstance(sample, TrackedPose):
+        return TRACKER + sample.sensor
+    if type(sample) not in _SAMPLE_TOPICS:
+        raise ConvertError('topic', f'no topic of the contract carries a {type(sample).__name__}')
+    return _SAMPLE_TOPICS[type(sample)]
 
 
 def topic_spec(name: str) -> Topic:

@@ -101,7 +101,7 @@ def test_simulate_writes_a_bag_with_truth_and_the_same_seed_the_same_samples(tmp
 
 
 def test_map_build_convert_and_info(tmp_path):
-    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.mapping.map_files import load_map
 
     assert run('map', 'build', 'R1', 'box.npz', '--spacing', '0.03', cwd=tmp_path).returncode == 0
     assert run('map', 'convert', 'box.npz', 'box.ply', cwd=tmp_path).returncode == 0

@@ -25,7 +25,7 @@ from msg_tools import convert
 from msg_tools.errors import ConvertError
 from msg_tools.factory import bag_messages, deserialize, ros_messages
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord
-from msg_tools.topics import tip_of, topic_spec, TOPICS, TRACKER
+from msg_tools.topics import INPUTS, tip_of, topic_of, topic_spec, TOPICS, TRACKER
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -167,12 +167,15 @@ def _estimate():
 def test_every_measurement_survives_the_round_trip(make, topic, data):
     item = data.draw(MEASUREMENTS[topic])
     assert_equal(item, TOPICS[topic].decode(TOPICS[topic].encode(make, item), None, topic))
+    if topic in (*INPUTS, 'ground_truth/poses'):
+        assert topic_of(item) == topic
 
 
 @flavours
 @given(pose=tracked())
 @settings(max_examples=25, deadline=None)
 def test_a_tracked_pose_survives_and_its_topic_names_the_sensor(make, pose):
+    assert topic_of(pose) == TRACKER + pose.sensor
     spec = topic_spec(TRACKER + pose.sensor)
     assert_equal(pose, spec.decode(spec.encode(make, pose), None, TRACKER + pose.sensor), 1e-8)
 
@@ -423,6 +426,8 @@ def test_poses_must_be_poses_in_the_map():
 def test_unknown_topics_are_named():
     with pytest.raises(ConvertError, match='tracker/<sensor>'):
         topic_spec('tracker/')
+    with pytest.raises(ConvertError, match='carries a PosesRecord'):
+        topic_of(PosesRecord(1, np.eye(4)[None]))
 
 
 @given(data=st.binary(max_size=400), topic=st.sampled_from(list(MEASUREMENTS)))

@@ -6,7 +6,8 @@ Planarity is what the paper defines.
 
 from continuum_loc.mapping.build import DENSITY, local_shape, map_from_cloud, sample_mesh
 from continuum_loc.mapping.errors import MapError
-from continuum_loc.mapping.prior_map import load_map, PriorMap
+from continuum_loc.mapping.map_files import load_map
+from continuum_loc.mapping.prior_map import PriorMap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp

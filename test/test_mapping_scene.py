@@ -18,7 +18,14 @@ from continuum_loc.mapping.anomalies import (
 )
 from continuum_loc.mapping.build import sample_mesh
 from continuum_loc.mapping.errors import MapError
-from continuum_loc.mapping.reconstruct import reconstruct, RingTrajectory, root_mean_square
+from continuum_loc.mapping.free_space import passes
+from continuum_loc.mapping.fuse import fuse
+from continuum_loc.mapping.reconstruct import (
+    distances_to_mesh,
+    reconstruct,
+    RingTrajectory,
+    root_mean_square,
+)
 from continuum_loc.mapping.splat_cast import first_crossings
 from continuum_loc.measurements import TofFrame
 from continuum_loc.robot import load_robot
@@ -294,3 +301,67 @@ def test_precision_and_recall_count_kind_and_place(changed_room):
     assert result.precision[0] == 0.0 and result.recall[0] == 0.0
     nothing_kept = precision_recall(detected, swapped, [1.1])
     assert nothing_kept.precision[0] == 1.0 and nothing_kept.recall[0] == 0.0
+
+
+def test_fused_surfels_are_nearer_to_the_surface_than_points_and_say_how_near():
+    """Averaging over the beams of a surfel leaves less than half of a range's error."""
+    trajectory, mesh = swaying(), room(COMMON)
+    cloud = reconstruct(ROBOT, measured(trajectory, mesh, seed=8), trajectory)
+    scene = fuse(cloud)
+    off = distances_to_mesh(scene.points, mesh.vertices, mesh.faces)
+    raw = cloud.distances_to_mesh(mesh.vertices, mesh.faces)
+    assert len(scene.points) < len(cloud.points)
+    assert np.median(off) < 0.5 * np.median(raw)
+    assert root_mean_square(off) < 0.75 * root_mean_square(raw)
+    assert np.mean(off <= 3.0 * scene.sigma) > 0.85
+    assert np.linalg.eigvalsh(scene.covariance).min() > 0.0
+    np.testing.assert_allclose(np.linalg.norm(scene.normals, axis=1), 1.0)
+
+
+def test_a_pose_error_that_all_beams_share_does_not_average_out():
+    covariance = np.zeros((FRAMES, 4, 6, 6))
+    covariance[:, :, :3, :3] = 0.005**2 * np.eye(3)
+    trajectory = swaying(covariance)
+    scene = fuse(reconstruct(ROBOT, measured(trajectory, room(), seed=9), trajectory))
+    assert scene.sigma.min() >= 0.005
+
+
+def test_a_fused_scene_survives_its_file(tmp_path):
+    import open3d
+
+    trajectory = swaying()
+    scene = fuse(reconstruct(ROBOT, measured(trajectory, room())[:90], trajectory))
+    scene.save(tmp_path / 'scene.ply')
+    read = open3d.t.io.read_point_cloud(str(tmp_path / 'scene.ply')).point
+    np.testing.assert_array_equal(read.positions.numpy(), scene.points)
+    np.testing.assert_allclose(read.sigma.numpy().ravel(), scene.sigma, rtol=1e-5)
+
+
+def test_a_beam_passes_the_cells_that_it_enters_and_leaves():
+    """Against the slab test on every cell."""
+    rng = np.random.default_rng(10)
+    edge, cells = 0.1, np.unique(rng.integers(-6, 6, (300, 3)), axis=0)
+    origins, ends = rng.uniform(-0.9, 0.9, (2, 400, 3))
+    lengths = np.linalg.norm(ends - origins, axis=1)
+    directions = (ends - origins) / lengths[:, None]
+    sides = (edge * (cells[None, :, None] + np.arange(2)[:, None]) - origins[:, None, None]) / (
+        directions[:, None, None]
+    )
+    enters, leaves = sides.min(axis=2).max(axis=-1), sides.max(axis=2).min(axis=-1)
+    through = (enters < leaves) & (leaves > 0.0) & (leaves < lengths[:, None])
+    counted = passes(cells, edge, origins, directions, lengths)
+    np.testing.assert_array_equal(counted, through.sum(axis=0))
+    assert counted.sum() > 100
+
+
+def test_what_a_missing_thing_has_laid_open_is_no_new_thing():
+    """The floor under the cube is not in the map of the room with the cube on it."""
+    trajectory = swaying()
+    filled = trimesh.creation.box((0.7, 0.7, 0.6))
+    filled.apply_translation((0, 0, 0.3))
+    free = filled.difference(CUBE)
+    free.invert()
+    prior = sample_mesh(free.vertices, free.faces, spacing=0.01)
+    cloud = reconstruct(ROBOT, measured(trajectory, room(), seed=11), trajectory)
+    kinds = {cluster.kind for cluster in detect_anomalies(cloud, prior, WIDE)}
+    assert kinds == {'missing'}

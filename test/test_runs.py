@@ -1,5 +1,6 @@
 """Replays are deterministic and lose nothing on their way into a run folder and back."""
 
+from dataclasses import replace
 import json
 import multiprocessing
 
@@ -16,6 +17,10 @@ from continuum_loc.evaluation.runs import (
 from continuum_loc.evaluation.tracks import Track
 from continuum_loc.measurements import NANOSECONDS, TofFrame
 from continuum_loc.robot import load_robot
+from evo import main_ape
+from evo.core.metrics import PoseRelation
+from evo.core.sync import associate_trajectories
+from evo.tools.file_interface import read_tum_trajectory_file
 import numpy as np
 import pytest
 from synthetic import NoisyFilter, samples, START, truth_at
@@ -59,6 +64,22 @@ def test_estimates_before_the_first_fit_are_counted_and_not_judged(result):
     assert estimates['judged'] == estimates['tracking'] == 25
 
 
+def test_an_error_is_silent_where_the_filter_does_not_say_lost(result):
+    track = result.track
+    off, said = track.T_map_ring.copy(), track.status.copy()
+    off[10:25, 3, 0, 3] += 0.2
+    said[10:13] = 'lost'
+
+    def silent(**changes):
+        return summary_of(replace(result, track=replace(track, **changes)))['silent_seconds']
+
+    assert silent() == 0.0
+    assert silent(T_map_ring=off) == (track.stamps[24] - track.stamps[10]) / NANOSECONDS
+    assert (
+        silent(T_map_ring=off, status=said) == (track.stamps[24] - track.stamps[13]) / NANOSECONDS
+    )
+
+
 def test_real_time_factor_is_data_time_over_processing_time(result):
     assert result.data_seconds == pytest.approx(2.99)
     assert result.real_time_factor == pytest.approx(2.99 / result.processing_seconds)
@@ -100,6 +121,24 @@ def test_a_run_folder_gives_back_what_went_in(result, tmp_path):
     # Strict: no NaN, no Infinity.
     json.loads((folder / 'summary.json').read_text(), parse_constant=pytest.fail)
     yaml.safe_load((folder / 'configuration.yaml').read_text())
+
+
+def test_evo_ape_finds_the_figures_of_the_summary_in_the_exported_trajectories(result, tmp_path):
+    """Truth comes at another rate than the estimates, and the first are not judged."""
+    shifted = replace(result.truth, stamps=result.truth.stamps + 3 * NANOSECONDS // 1000)
+    summary = save_run(
+        tmp_path, replace(result, truth=shifted), kind='replay', seed=0, configuration={}
+    )
+    files = (tmp_path / 'trajectories' / f'{name}_ring5.tum' for name in ('truth', 'estimate'))
+    truth, estimate = associate_trajectories(*map(read_tum_trajectory_file, files))
+    for relation, kind, unit in (
+        (PoseRelation.translation_part, 'translation', 'm'),
+        (PoseRelation.rotation_angle_deg, 'rotation', 'deg'),
+    ):
+        theirs = main_ape.ape(truth, estimate, relation).stats
+        ours = summary['rings']['ring5']
+        assert ours[f'{kind}_mae_{unit}'] == pytest.approx(theirs['mean'], abs=1e-6)
+        assert ours[f'{kind}_rmse_{unit}'] == pytest.approx(theirs['rmse'], abs=1e-6)
 
 
 def test_runs_are_numbered_and_latest_leads_to_the_newest(tmp_path):

@@ -16,7 +16,7 @@ from continuum_loc.evaluation.runs import save_run
 from continuum_loc.evaluation.study import at_most, Claim, write_study
 from continuum_loc.evaluation.study_report import write_study_report
 from continuum_loc.evaluation.trials import make_filter
-from continuum_loc.mapping.prior_map import load_map
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.robot import RobotDescription
 
 BAG_SUFFIXES = ('.mcap', '.db3')

@@ -201,7 +201,7 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
     if summary_file.is_file():
         summary = json.loads(summary_file.read_text())
         if summary.get('configuration_digest') == key:
-            return Outcome(trial, summary)
+            return Outcome(trial, _complete(summary, folder))
     (folder / 'error.txt').unlink(missing_ok=True)
     result = replay(bag, estimator)
     return Outcome(
@@ -215,6 +215,15 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
             extra={'configuration_digest': key},
         ),
     )
+
+
+def _complete(summary: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the summary with the figures that were not computed yet when its run was made."""
+    from continuum_loc.evaluation.runs import load_run, summary_of
+
+    if 'silent_seconds' in summary:
+        return summary
+    return summary | plain(summary_of(load_run(folder).result))
 
 
 def show_progress(results: Iterator[Any], total: int, label: str) -> Iterator[Any]:

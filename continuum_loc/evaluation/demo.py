@@ -20,7 +20,7 @@ from continuum_loc.evaluation.runs import distribution, load_run, new_run, save_
 from continuum_loc.evaluation.study import at_least, at_most, Claim
 from continuum_loc.evaluation.tracks import BASE, Track
 from continuum_loc.evaluation.trials import configuration, make_filter, scene_map_file, Trial
-from continuum_loc.mapping.prior_map import load_map
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import TofFrame
 from continuum_loc.robot import load_robot, RobotDescription
 import numpy as np

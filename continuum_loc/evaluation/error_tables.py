@@ -61,6 +61,10 @@ def condition_table(
                 'trials': len(members) - failed,
                 'failed': failed,
                 'lost [%]': lost_share(members),
+                'silent [s]': max(
+                    (one.summary['silent_seconds'] for one in members if one.summary is not None),
+                    default=float('nan'),
+                ),
             }
         )
     return rows

@@ -67,7 +67,7 @@ def error_figure(found: Errors, kind: str, lost: np.ndarray, epoch: int) -> go.F
     for start, end in spans(time, lost):
         figure.add_vrect(x0=start, x1=end, fillcolor='#f5b700', opacity=0.25, line_width=0)
     figure.update_xaxes(title_text='time [s]', row=len(rings), col=1)
-    return _styled(figure, 130 * len(rings) + 70)
+    return styled(figure, 130 * len(rings) + 70)
 
 
 def _error_and_band(found: Errors, kind: str, ring: int) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +140,7 @@ def component_figure(found: Errors, epoch: int) -> go.Figure:
         cols=2,
         shared_xaxes=True,
         vertical_spacing=0.07,
-        horizontal_spacing=0.09,
+        horizontal_spacing=0.14,
         subplot_titles=[
             COMPONENTS[i] for pair in zip(range(3), range(3, 6), strict=True) for i in pair
         ],
@@ -186,7 +186,7 @@ def component_figure(found: Errors, epoch: int) -> go.Figure:
     figure.update_yaxes(title_text='cm', col=1)
     figure.update_yaxes(title_text='deg', col=2)
     figure.update_xaxes(title_text='time [s]', row=3)
-    return _styled(figure, 560, top=70)
+    return styled(figure, 560, top=70)
 
 
 def _ring_menu(names: tuple[str, ...]) -> dict:
@@ -241,7 +241,7 @@ def time_histogram(milliseconds: np.ndarray, title: str, limit: float | None = N
         )
     figure.update_xaxes(title_text=title)
     figure.update_yaxes(title_text='steps')
-    return _styled(figure, 280)
+    return styled(figure, 280)
 
 
 def consistency_figure(result: ReplayResult, found: Errors) -> go.Figure:
@@ -275,7 +275,7 @@ def consistency_figure(result: ReplayResult, found: Errors) -> go.Figure:
     figure.update_yaxes(type='log', title_text='normalised squared')
     figure.update_xaxes(title_text='time [s]')
     figure.update_layout(legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0})
-    return _styled(figure, 280, top=40)
+    return styled(figure, 280, top=40)
 
 
 def scene_figure(around: Surroundings, shown: list[Moment], epoch: int) -> go.Figure:
@@ -511,7 +511,8 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return np.asarray(values, np.float32)
 
 
-def _styled(figure: go.Figure, height: int, top: int = 20) -> go.Figure:
+def styled(figure: go.Figure, height: int, top: int = 20) -> go.Figure:
+    """Give a chart the look of the report, and return it."""
     figure.update_layout(
         template='plotly_white',
         height=height,

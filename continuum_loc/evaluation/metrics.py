@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from continuum_loc import lie
 from continuum_loc.evaluation.tracks import associate, Track
+from continuum_loc.measurements import NANOSECONDS
 import numpy as np
 from scipy.stats import chi2
 
@@ -120,6 +121,13 @@ def _figures(found: Errors, columns: int | slice) -> dict[str, float]:
         'coverage_95': coverage,
         'invalid_covariances': int((~known).sum()),
     }
+
+
+def longest_stretch(stamps: np.ndarray, flags: np.ndarray) -> float:
+    """Return the longest time [s] over which `flags` (K,) stay true; 0 for a single instant."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    starts, ends = edges.reshape(-1, 2).T
+    return float(np.max(stamps[ends - 1] - stamps[starts], initial=0)) / NANOSECONDS
 
 
 FIGURES = (

@@ -16,13 +16,14 @@ from pathlib import Path
 import re
 from typing import Any
 
-from continuum_loc.evaluation.metrics import errors, summarise
+from continuum_loc.evaluation.metrics import Errors, errors, longest_stretch, summarise
 from continuum_loc.evaluation.replay import Cloud, ReplayResult
 from continuum_loc.evaluation.study import plain, versions, write_json
 from continuum_loc.evaluation.tracks import associate, save_tum, Track
 import numpy as np
 import yaml
 
+LOST_ERROR = 0.05  # m: a ring that is off by more is not where the filter says
 TRACKS = ('track', 'lagged', 'truth')
 
 
@@ -99,8 +100,9 @@ def save_run(
     (folder / 'configuration.yaml').write_text(
         yaml.safe_dump(plain(configuration), sort_keys=False)
     )
-    for name, prefix in zip(TRACKS, ('estimate', 'lagged', 'truth'), strict=True):
-        save_tum(getattr(result, name), folder / 'trajectories', prefix)
+    tracks = (result.track, result.lagged, judged_truth(result))
+    for track, prefix in zip(tracks, ('estimate', 'lagged', 'truth'), strict=True):
+        save_tum(track, folder / 'trajectories', prefix)
     _save_result(folder / 'result.npz', result)
     return plain(summary)
 
@@ -113,8 +115,10 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
     """
     judged = settled(result.track)
     status = result.track.status
+    found = errors(judged, result.truth)
     summary = {
-        **summarise(errors(judged, result.truth)),
+        **summarise(found),
+        'silent_seconds': silent_seconds(judged, found),
         'lagged': summarise(errors(settled(result.lagged), result.truth))
         if len(result.lagged)
         else None,
@@ -137,6 +141,38 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
     if len(result.latency_seconds):
         summary['latency_ms'] = distribution(1e3 * result.latency_seconds)
     return summary
+
+
+def silent_seconds(judged: Track, found: Errors) -> float:
+    """
+    Return the longest time [s] for which a ring was off and the filter did not say lost.
+
+    Off: by more than LOST_ERROR.
+    """
+    off = found.translation_m[:, 1:].max(axis=1, initial=0.0) > LOST_ERROR
+    if judged.status is not None:
+        off &= ~np.isin(found.stamps, judged.stamps[judged.status == 'lost'])
+    return longest_stretch(found.stamps, off)
+
+
+def judged_truth(result: ReplayResult) -> Track:
+    """
+    Return the truth at the instants that are judged; all of it where there are none.
+
+    Other programs pair each estimate with the nearest truth, which is up to half a period away;
+    given the truth at the very instants they find the figures of the summary.
+    """
+    stamps = np.unique(
+        np.concatenate(
+            [
+                associate(settled(track), result.truth)[0].stamps
+                for track in (result.track, result.lagged)
+            ]
+        )
+    )
+    if len(stamps) == 0:
+        return result.truth
+    return Track(stamps, result.truth.names, result.truth.at(stamps))
 
 
 def settled(track: Track) -> Track:

@@ -25,11 +25,12 @@ def write_study_report(
     claims: Sequence[Claim],
     tables: dict[str, list[dict[str, Any]]],
     outcomes: Sequence[Outcome],
+    runs: Path | None = None,
 ) -> Path:
     """
-    Write `out/report.html`.
+    Write `out/report.html`. The worst trial is the one with the greatest mean error.
 
-    `tables` by title, as rows; the worst trial is the one with the greatest mean error.
+    tables: by title, as rows. runs: the campaign's folder, by default `out`.
     """
     ranked = sorted(
         (one for one in outcomes if one.summary is not None),
@@ -60,7 +61,7 @@ def write_study_report(
         )
     page = Page(title, f'{len(outcomes)} trials', cards, groups)
     path = out / 'report.html'
-    path.write_text(render(with_worst_trial(page, out, ranked)))
+    path.write_text(render(with_worst_trial(page, runs or out, ranked)))
     return path
 
 
@@ -120,18 +121,19 @@ def worst_part(ranked: Sequence[Outcome]) -> Part:
     )
 
 
+def unbroken(value: Any) -> str:
+    """Write a cell so that a mean and its deviation, a map and its scene stay on one line."""
+    return str(value).replace(' ± ', '\u00a0±\u00a0').replace(' - ', '\u00a0-\u00a0')
+
+
 def as_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Rows of mappings with equal keys as a table of the page."""
     columns = list(rows[0]) if rows else []
     words = [
         index for index, name in enumerate(columns) if rows and isinstance(rows[0][name], str)
     ]
-    # A mean and its deviation stay on one line.
     return Table(
         columns,
-        [
-            Row([str(row[name]).replace(' ± ', '\u00a0±\u00a0') for name in columns])
-            for row in rows
-        ],
+        [Row([unbroken(row[name]) for name in columns]) for row in rows],
         words,
     )

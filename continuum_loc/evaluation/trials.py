@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 
 from continuum_loc import lie
 from continuum_loc.evaluation.replay import Filter, replay, ReplayResult
-from continuum_loc.measurements import Measurement, TrackedPose, TruthSample
+from continuum_loc.measurements import Measurement, TruthSample
 from continuum_loc.robot import load_robot, RobotDescription
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,15 +31,6 @@ MAP_POINTS = 300_000
 MOUNTING_ERROR = (0.002, 1.0)  # m, deg
 GYRO_BIAS = 0.01  # rad/s
 TOF_CLOCK_OFFSET = 0.010  # s
-
-TOPICS = {
-    'TofFrame': 'tof/points',
-    'ImuSample': 'imu/data_raw',
-    'FieldSample': 'imu/mag',
-    'StrainSample': 'strain',
-    'EncoderSample': 'joint_states',
-    'TruthSample': 'ground_truth/poses',
-}
 
 
 @dataclass(frozen=True)
@@ -174,7 +165,7 @@ def make_filter(
 
 def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:
     """Return the prior map of a scene, sampled from its mesh once and kept on disk."""
-    from continuum_loc.mapping.prior_map import load_map
+    from continuum_loc.mapping.map_files import load_map
 
     return load_map(scene_map_file(scene_name, points, seed))
 
@@ -208,18 +199,10 @@ def map_cache() -> Path:
     )
 
 
-def topic_of(sample: Measurement | TruthSample) -> str:
-    """Name the topic of the contract that carries this sample."""
-    return (
-        f'tracker/{sample.sensor}'
-        if isinstance(sample, TrackedPose)
-        else TOPICS[type(sample).__name__]
-    )
-
-
 def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[str, int]:
     """Record samples into a new bag folder; how many of each topic."""
     from msg_tools.bag import BagWriter
+    from msg_tools.topics import topic_of
 
     counts: dict[str, int] = {}
     with BagWriter(path) as bag:

@@ -17,7 +17,7 @@ from continuum_loc.evaluation.campaign import parallel
 from continuum_loc.evaluation.replay import replay
 from continuum_loc.evaluation.runs import summary_of
 from continuum_loc.evaluation.trials import make_filter
-from continuum_loc.mapping.prior_map import load_map
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 import numpy as np

@@ -25,6 +25,7 @@ from typing import Literal, NamedTuple
 
 from continuum_loc.mapping.build import DENSITY
 from continuum_loc.mapping.errors import MapError
+from continuum_loc.mapping.free_space import passes
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.reconstruct import distances_to_mesh, Reconstruction
 from continuum_loc.mapping.splat_cast import first_crossings
@@ -40,12 +41,22 @@ class AnomalySettings(Settings):
     """Thresholds of the detector."""
 
     tau: float = Field(
-        16.3,
+        9.0,
         gt=0.0,
-        description='squared Mahalanobis distance of a new point (chi2, 3 dof, 0.1 %)',
+        description='squared Mahalanobis distance of a new point: 3 standard deviations',
     )
     min_distance: float = Field(
         0.01, ge=0.0, description='nothing closer to the map than this is new or missing [m]'
+    )
+    clear: float = Field(
+        2.0,
+        ge=0.0,
+        description='standard deviations short of its end up to which a beam has seen through',
+    )
+    stray_share: float = Field(
+        0.35,
+        ge=0.0,
+        description='share of the beams through a cell below which new points in it are stray',
     )
     search_radius: float = Field(
         0.3, gt=0.0, description='a point with no map within this is new outright [m]'
@@ -56,9 +67,9 @@ class AnomalySettings(Settings):
     min_share: float = Field(
         0.5, gt=0.0, le=1.0, description='share of disagreeing beams that makes a cell suspect'
     )
-    min_beams: int = Field(6, ge=1, description='disagreeing beams that a cluster needs')
+    min_beams: int = Field(10, ge=1, description='disagreeing beams that a cluster needs')
     min_size: float = Field(
-        0.02, ge=0.0, description='extent that a cluster needs [m]: map edges fray by less'
+        0.025, ge=0.0, description='extent that a cluster needs [m]: map edges fray by less'
     )
     disc: float = Field(
         0.6,
@@ -68,6 +79,9 @@ class AnomalySettings(Settings):
     min_frames: int = Field(2, ge=1, description='different instants that they must come from')
     link: float = Field(
         0.03, gt=0.0, description='cells closer than this belong to one cluster [m]'
+    )
+    min_confidence: float = Field(
+        0.6, ge=0.0, le=1.0, description='confidence from which a cluster is worth a look'
     )
     confidence_z: float = Field(
         1.64, gt=0.0, description="standard deviations of the confidence's lower bound"
@@ -112,6 +126,36 @@ class Evidence(NamedTuple):
     stamps: np.ndarray
 
 
+class Beams(NamedTuple):
+    """
+    All beams of a reconstruction, those that met nothing last.
+
+    origins: (B, 3) [m]; directions: (B, 3) unit; lengths: (B,) [m]; sigma: (B,) [m] standard
+    deviation along the beam, 0 without a return; stamps: (B,).
+    """
+
+    origins: np.ndarray
+    directions: np.ndarray
+    lengths: np.ndarray
+    sigma: np.ndarray
+    stamps: np.ndarray
+
+    @classmethod
+    def of(cls, reconstruction: Reconstruction) -> Beams:
+        """Take the beams to every point, and those without a return as far as sensors reach."""
+        r = reconstruction
+        origins = np.concatenate([r.origins, r.open_origins])
+        along = np.concatenate([r.points, r.open_ends]) - origins
+        length = np.linalg.norm(along, axis=1)
+        directions = along / np.maximum(length, 1e-12)[:, None]
+        hit = directions[: len(r.points)]
+        sigma = np.zeros(len(along))
+        sigma[: len(hit)] = np.sqrt(np.einsum('ni,nij,nj->n', hit, r.covariance, hit))
+        # Each open beam counts as an instant of its own: they come from all over the run.
+        stamps = np.concatenate([r.stamps, np.arange(len(r.open_origins))])
+        return cls(origins, directions, length, sigma, stamps)
+
+
 def detect_anomalies(
     reconstruction: Reconstruction,
     prior: PriorMap,
@@ -125,11 +169,11 @@ def detect_anomalies(
     """
     settings = settings or AnomalySettings()
     index = index or prior.index(reach=0.05)
-    gone, through = missing_evidence(reconstruction, prior, settings, index)
-    missing = clusters(gone, 'missing', settings)
-    added = clusters(
-        new_evidence(reconstruction, prior, settings, index, through), 'added', settings
-    )
+    beams = Beams.of(reconstruction)
+    missing = clusters(missing_evidence(beams, prior, settings, index), 'missing', settings)
+    behind = behind_map(beams, prior, index, len(reconstruction.points))
+    new = new_evidence(reconstruction, prior, settings, index, behind)
+    added = clusters(new, 'added', settings, beams)
     return sorted(added + missing, key=lambda cluster: -cluster.confidence)
 
 
@@ -138,18 +182,18 @@ def new_evidence(
     prior: PriorMap,
     settings: AnomalySettings,
     index: VoxelIndex,
-    through: np.ndarray | None = None,
+    behind: np.ndarray | None = None,
 ) -> Evidence:
     """
-    Judge every measured point by whether it lies off the map (eq. 12).
+    Judge every measured point by whether it lies off the map (eq. 12), and before it.
 
-    Not of a beam that went `through` (N,) the map: what a missing thing has laid open is no new
-    thing.
+    What lies `behind` the map (N,), on the beam, is no new thing: the range erred, or something
+    missing has laid it open.
     """
     distance2, offset = mahalanobis2(reconstruction, prior, settings.search_radius, index)
     disagrees = (distance2 > settings.tau) & (offset > settings.min_distance)
-    if through is not None:
-        disagrees &= ~through
+    if behind is not None:
+        disagrees &= ~behind
     return Evidence(reconstruction.points, disagrees, reconstruction.stamps)
 
 
@@ -177,36 +221,50 @@ def tangential_variance(prior: PriorMap) -> float:
 
 
 def missing_evidence(
-    reconstruction: Reconstruction, prior: PriorMap, settings: AnomalySettings, index: VoxelIndex
-) -> tuple[Evidence, np.ndarray]:
+    beams: Beams, prior: PriorMap, settings: AnomalySettings, index: VoxelIndex
+) -> Evidence:
     """
-    Judge every mapped surface that a beam should have met first.
-
-    Did the beam go through it, or end on it? And for each measured point (N,), whether its beam
-    did go through.
+    Judge every mapped surface that a beam should have met first: did the beam go through it.
 
     A beam that ends in front of the mapped surface says nothing about it. One without a return
     went its whole length.
     """
-    r = reconstruction
-    origins = np.concatenate([r.origins, r.open_origins])
-    beams = np.concatenate([r.points, r.open_ends]) - origins
-    length = np.linalg.norm(beams, axis=1)
-    directions = beams / np.maximum(length, 1e-12)[:, None]
-    sigma = np.zeros(len(beams))
-    hit = directions[: len(r.points)]
-    sigma[: len(hit)] = np.sqrt(np.einsum('ni,nij,nj->n', hit, r.covariance, hit))
-    margin = np.maximum(np.sqrt(settings.tau * (sigma**2 + prior.sigma**2)), settings.min_distance)
-    row, depth = first_crossings(
-        prior, index, origins, directions, length + margin, radius=settings.disc * prior.spacing
+    margin = np.maximum(
+        np.sqrt(settings.tau * (beams.sigma**2 + prior.sigma**2)), settings.min_distance
     )
-    met, through = row >= 0, length - depth > margin
-    stamps = np.concatenate([r.stamps, np.arange(len(r.open_origins))])
-    return Evidence(prior.points[row[met]], through[met], stamps[met]), through[: len(r.points)]
+    row, depth = first_crossings(
+        prior,
+        index,
+        beams.origins,
+        beams.directions,
+        beams.lengths + margin,
+        radius=settings.disc * prior.spacing,
+    )
+    met, through = row >= 0, beams.lengths - depth > margin
+    return Evidence(prior.points[row[met]], through[met], beams.stamps[met])
 
 
-def clusters(evidence: Evidence, kind: Kind, settings: AnomalySettings) -> list[AnomalyCluster]:
-    """Join the cells in which most beams disagree with the map."""
+def behind_map(beams: Beams, prior: PriorMap, index: VoxelIndex, count: int) -> np.ndarray:
+    """
+    Whether the map lies before the end of each of the first `count` beams.
+
+    The map's discs are taken so large that they leave no gaps.
+    """
+    first = slice(None, count)
+    row, depth = first_crossings(
+        prior, index, beams.origins[first], beams.directions[first], beams.lengths[first]
+    )
+    return (row >= 0) & (depth < beams.lengths[first])
+
+
+def clusters(
+    evidence: Evidence, kind: Kind, settings: AnomalySettings, beams: Beams | None = None
+) -> list[AnomalyCluster]:
+    """
+    Join the cells in which most beams disagree with the map.
+
+    beams: of which those that run clear through a cell speak against anything new in it.
+    """
     if not evidence.disagrees.any():
         return []
     cells, cell_of = np.unique(
@@ -215,8 +273,16 @@ def clusters(evidence: Evidence, kind: Kind, settings: AnomalySettings) -> list[
     cell_of = cell_of.ravel()
     total = np.bincount(cell_of, minlength=len(cells))
     against = np.bincount(cell_of, weights=evidence.disagrees, minlength=len(cells))
-    suspect = against >= settings.min_share * total
-    suspect &= against > 0
+    suspect = (against > 0) & (against >= settings.min_share * total)
+    if beams is not None:
+        seen_through = passes(
+            cells[suspect],
+            settings.cell,
+            beams.origins,
+            beams.directions,
+            beams.lengths - np.maximum(settings.clear * beams.sigma, settings.min_distance),
+        )
+        suspect[suspect] = against[suspect] >= settings.stray_share * seen_through
     label = np.full(len(cells), -1)
     label[suspect] = _linked((cells[suspect] + 0.5) * settings.cell, settings.link)
     found = (

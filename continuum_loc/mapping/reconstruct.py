@@ -88,7 +88,7 @@ class Reconstruction:
     N measured surface points in `map`, and M beams that met nothing.
 
     points, origins: (N, 3) [m], where the beam ended and began; covariance: (N, 3, 3) [m^2] of
-    `points`.
+    `points`; range_sigma: (N,) [m] its share along the beam that is the range's own.
     stamps: (N,) ns; sensors: names; sensor: (N,) number of the sensor in `sensors`.
     open_origins, open_ends: (M, 3) [m] of beams without a return, ending at the sensor's greatest
     range.
@@ -98,6 +98,7 @@ class Reconstruction:
 
     points: np.ndarray
     covariance: np.ndarray
+    range_sigma: np.ndarray
     origins: np.ndarray
     stamps: np.ndarray
     sensor: np.ndarray
@@ -192,6 +193,7 @@ def reconstruct(
     return Reconstruction(
         points=in_map[frame_of, zone],
         covariance=covariance,
+        range_sigma=stack.sigma[frame_of, zone],
         origins=T_map_sensor[frame_of, :3, 3],
         stamps=stack.stamps[frame_of],
         sensor=stack.sensor[frame_of],

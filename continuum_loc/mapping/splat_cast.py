@@ -61,9 +61,7 @@ def _cast(arrays, normals, origins, directions, lengths, radius, min_cos, orient
 @njit(cache=True)
 def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos, oriented):
     """
-    March through the index's blocks (Amanatides and Woo, 1987).
-
-    The march ends where the next block lies beyond the best crossing.
+    March through the index's blocks until the next one lies beyond the best crossing.
 
     A disc is looked for in the block of its centre only. One that reaches from a neighbouring
     block, through which
@@ -71,22 +69,9 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
     thinner cover.
     """
     edge = arrays.voxel * BLOCK
-    at, step, until, stride = (
-        np.empty(3, np.int64),
-        np.empty(3, np.int64),
-        np.empty(3),
-        np.empty(3),
-    )
     corner = (arrays.x0, arrays.y0, arrays.z0)
     extent = (arrays.blocks_x, arrays.blocks_y, arrays.blocks_z)
-    for axis in range(3):
-        offset = (origin[axis] - corner[axis]) / edge
-        at[axis] = int(np.floor(offset))
-        step[axis] = 1 if direction[axis] > 0.0 else -1
-        moving = abs(direction[axis]) > 1e-12
-        stride[axis] = edge / abs(direction[axis]) if moving else np.inf
-        ahead = at[axis] + 1 - offset if step[axis] > 0 else offset - at[axis]
-        until[axis] = ahead * stride[axis] if moving else np.inf
+    at, step, until, stride = start_march(origin, direction, corner, edge)
     best, depth, entered = -1, length, 0.0
     while entered <= depth:
         if 0 <= at[0] < extent[0] and 0 <= at[1] < extent[1] and 0 <= at[2] < extent[2]:
@@ -105,11 +90,39 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
                     best,
                     depth,
                 )
-        axis = int(np.argmin(until))
-        entered = until[axis]
-        until[axis] += stride[axis]
-        at[axis] += step[axis]
+        entered = next_cell(at, step, until, stride)
     return best, (depth if best >= 0 else np.inf)
+
+
+@njit(cache=True)
+def start_march(origin, direction, corner, edge):
+    """
+    Start a march through cells of `edge` [m] counted from `corner` (Amanatides and Woo, 1987).
+
+    Returns its state: the cell, the step per axis, how far along the ray the cell's next side is,
+    and how far apart such sides are.
+    """
+    at, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    until, stride = np.empty(3), np.empty(3)
+    for axis in range(3):
+        offset = (origin[axis] - corner[axis]) / edge
+        at[axis] = int(np.floor(offset))
+        step[axis] = 1 if direction[axis] > 0.0 else -1
+        moving = abs(direction[axis]) > 1e-12
+        stride[axis] = edge / abs(direction[axis]) if moving else np.inf
+        ahead = at[axis] + 1 - offset if step[axis] > 0 else offset - at[axis]
+        until[axis] = ahead * stride[axis] if moving else np.inf
+    return at, step, until, stride
+
+
+@njit(cache=True)
+def next_cell(at, step, until, stride):
+    """Move a march (`start_march`) to its next cell; return how far along the ray it begins."""
+    axis = int(np.argmin(until))
+    entered = until[axis]
+    until[axis] += stride[axis]
+    at[axis] += step[axis]
+    return entered
 
 
 @njit(cache=True)

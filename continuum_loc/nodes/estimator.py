@@ -232,7 +232,7 @@ class EstimatorNode(WorkerNode):
         if not self.settings.map:
             self.get_logger().warning('no prior map: ToF sensors cannot be used (parameter `map`)')
             return None
-        from continuum_loc.mapping.prior_map import load_map
+        from continuum_loc.mapping.map_files import load_map
 
         return load_map(self.settings.map)
 

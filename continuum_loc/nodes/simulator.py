@@ -14,15 +14,6 @@ import threading
 import time
 from typing import Any
 
-from continuum_loc.measurements import (
-    EncoderSample,
-    FieldSample,
-    ImuSample,
-    StrainSample,
-    TofFrame,
-    TrackedPose,
-    TruthSample,
-)
 from continuum_loc.nodes.pacing import Paced
 from continuum_loc.nodes.parameters import guard, live_fields, read
 from continuum_loc.nodes.runtime import Delays, output_qos, PackageNode, run, write_summary
@@ -30,16 +21,8 @@ from continuum_loc.nodes.settings import SimulatorNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
-from msg_tools.topics import topic_spec, TRACKER
+from msg_tools.topics import topic_of, topic_spec, TRACKER
 
-TOPIC_OF = {
-    TofFrame: 'tof/points',
-    ImuSample: 'imu/data_raw',
-    FieldSample: 'imu/mag',
-    StrainSample: 'strain',
-    EncoderSample: 'joint_states',
-    TruthSample: 'ground_truth/poses',
-}
 SETTLED_MATCH = 0.5  # s after discovery says that all is matched until the data begins
 
 
@@ -157,9 +140,7 @@ class SimulatorNode(PackageNode):
         self.get_logger().info('data begins')
 
     def _deliver(self, stamp: int, sample: Any, delay: float) -> None:
-        topic = (
-            TRACKER + sample.sensor if isinstance(sample, TrackedPose) else TOPIC_OF[type(sample)]
-        )
+        topic = topic_of(sample)
         if topic == 'ground_truth/poses' and not self.settings.publish_truth:
             return
         sample = replace(sample, stamp=stamp + self._shift)

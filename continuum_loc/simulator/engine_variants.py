@@ -1,12 +1,9 @@
 """
-Scenes S1-S9: the engine with something changed.
-
-With objects that somebody left behind, with features that are gone, or with both.
+Scenes S1-S9: the engine with objects left behind, with features gone, or with both; H1-H3 to tune.
 
 Anomalies are 3-15 cm long and lie on the walls and blades round the robot's way (azimuth 0, 1 m
-from the axis).
-Their truth is exact: the solid that the variant has and the engine as built has not, or the
-reverse.
+from the axis). Their truth is exact: the solid that the variant has and the engine as built has
+not, or the reverse.
 """
 
 from __future__ import annotations
@@ -128,6 +125,31 @@ VARIANTS: dict[str, tuple[Change, ...]] = {
         Gone('weight_5'),
         Gone('bolt_17'),
         Bite('stator1_0', 0.95, 0.10),
+    ),
+    # For choosing a detector's thresholds, never for reporting what it reaches.
+    'H1': (
+        Left('can', 'hub', 0.70, -6.0),
+        Left('nut', 'casing', 0.66, 2.0),
+        Lodged('bolt', 'rotor1_15', 1.0),
+        Gone('weight_3'),
+        Bite('guide_vane_0', 0.95, 0.08),
+    ),
+    'H2': (
+        Left('ball', 'hub', 1.22, 6.0),
+        Left('clamp', 'hub', 0.62, 6.0, 50.0),
+        Lodged('nut', 'stator1_0', 1.0),
+        Gone('boss_2'),
+        Gone('bolt_2'),
+        Bite('stator1_19', 1.1, 0.06),
+    ),
+    'H3': (
+        Left('bolt', 'casing', 1.25, 3.0, 10.0),
+        Left('bracket', 'hub', 1.8, -4.0),
+        Lodged('ball', 'guide_vane_13', 1.0),
+        Gone('boss_1'),
+        Gone('bolt_16'),
+        Bite('rotor1_15', 1.05, 0.07),
+        Bite('rotor1_0', 0.95, 0.05),
     ),
 }
 

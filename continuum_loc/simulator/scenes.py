@@ -14,6 +14,7 @@ from pathlib import Path
 from continuum_loc.simulator.scene import Scene, SceneError
 
 ENGINE_SCENES = tuple(f'S{i}' for i in range(10))
+HOLD_OUT_SCENES = ('H1', 'H2', 'H3')  # the engine again, to tune a detector on
 BOX_SCENES = tuple(f'R{i}' for i in range(5))
 SCENE_NAMES = ENGINE_SCENES + BOX_SCENES
 MESH_SUFFIXES = ('.stl', '.obj', '.ply')
@@ -21,14 +22,14 @@ MESH_SUFFIXES = ('.stl', '.obj', '.ply')
 
 def load_scene(name_or_path: str | Path) -> Scene:
     """
-    Load a scene by name (`S0`-`S9`, `R0`-`R4`) or from a mesh file.
+    Load a scene by name or from a mesh file.
 
-    Files are STL, OBJ or PLY, in metres and the map frame.
+    Names: `S0`-`S9`, `H1`-`H3`, `R0`-`R4`. Files: STL, OBJ, PLY; metres, map frame.
 
     Raises SceneError for an unknown name, an unreadable file, or a mesh that is not fit for use.
     """
     name = str(name_or_path)
-    if name in SCENE_NAMES:
+    if name in SCENE_NAMES + HOLD_OUT_SCENES:
         return _built(name)
     if Path(name).suffix.lower() in MESH_SUFFIXES:
         from continuum_loc.simulator.mesh_import import import_mesh

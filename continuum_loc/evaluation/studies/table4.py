@@ -11,8 +11,9 @@ from typing import Any
 
 from continuum_loc.evaluation.campaign import Outcome, run_campaign
 from continuum_loc.evaluation.error_tables import figures, per_ring, trial_rows
+from continuum_loc.evaluation.split import HOLD_OUT
 from continuum_loc.evaluation.studies._soft_arm import FIDELITIES, soft_arm_trials
-from continuum_loc.evaluation.studies.table3 import of_fidelity
+from continuum_loc.evaluation.studies.table3 import judged, of_fidelity
 from continuum_loc.evaluation.study import at_most, Claim, write_study
 from continuum_loc.evaluation.study_report import write_study_report
 from continuum_loc.robot import load_robot
@@ -26,30 +27,36 @@ PAPER = (
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """Run the trials of Table III (those in `out` already are not run again), by ring."""
+    """
+    Judge the trials of Table III by ring, and write the results to `out/table4`.
+
+    Trials that are in `out` already are not run again.
+    """
     outcomes = run_campaign(soft_arm_trials(quick, seed), out, jobs)
+    folder = out / 'table4'
     claims, tables = [], {}
     for fidelity in FIDELITIES:
         members = of_fidelity(outcomes, fidelity)
         tables[f'table4_{fidelity}'] = _rows(members)
-        claims += _judge(members, fidelity)
+        claims += _judge(judged(members), fidelity)
     claims.append(
         at_most('trials that failed', sum(outcome.summary is None for outcome in outcomes), '', 0)
     )
     write_study(
-        out,
+        folder,
         claims,
         seed=seed,
         settings={'trials': [outcome.trial for outcome in outcomes]},
         tables={**tables, 'trials': trial_rows(outcomes)},
-        extra={'quick': quick},
+        extra={'quick': quick, 'hold_out': HOLD_OUT['soft_arm']},
     )
     write_study_report(
-        out,
+        folder,
         'Table IV: the soft arm, ring by ring',
         claims,
         {f'Errors, sensors as {name}': tables[f'table4_{name}'] for name in FIDELITIES},
         outcomes,
+        runs=out,
     )
     return claims
 
