@@ -13,7 +13,7 @@ from queue import SimpleQueue
 import threading
 import time
 import traceback
-from typing import Any
+from typing import Any, TypeVar
 
 from continuum_loc.measurements import Measurement, NANOSECONDS
 from continuum_loc.nodes.intake import Inbox, Intake, Queued
@@ -26,6 +26,8 @@ from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
 from msg_tools.topics import topic_spec, TRACKER
 import numpy as np
+
+T = TypeVar('T')
 
 OK, WARN, ERROR, STALE = range(4)
 POLL = 0.1  # s; how often an idle worker looks whether it has to stop
@@ -68,6 +70,10 @@ class WorkerNode(PackageNode):
         Returns the stamp of the estimate if there is one.
         """
         raise NotImplementedError
+
+    def idle(self) -> bool:
+        """Do a little of what can wait, as no message does; False where there is nothing to do."""
+        return False
 
     def restart(self) -> None:
         """Forget the past: the data starts again. Called in the worker."""
@@ -172,7 +178,8 @@ class WorkerNode(PackageNode):
     def _work(self) -> None:
         try:
             while not self._stop.is_set():
-                queued = self.inbox.take(POLL)
+                leisure = not len(self.inbox) and self._attempt(self.idle, 'what it had seen')
+                queued = self.inbox.take(0.0 if leisure else POLL)
                 while not self._tasks.empty():
                     self._tasks.get()()
                 if queued is not None:
@@ -194,19 +201,23 @@ class WorkerNode(PackageNode):
         if measurement is None:
             return
         begin = time.perf_counter()
+        stamp = self._attempt(lambda: self.consume(measurement), queued.topic)
+        if stamp is not None:
+            self._note(stamp, queued, time.perf_counter() - begin)
+
+    def _attempt(self, action: Callable[[], T], what: str) -> T | None:
+        """Do `action`; a failure on what it was given is counted, and the estimate starts anew."""
         try:
-            stamp = self.consume(measurement)
+            return action()
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
             self.failures += 1
             self.intake.refuse(
                 'failure',
-                f'the estimator failed on {queued.topic} ({type(error).__name__}: {error}) '
+                f'the estimator failed on {what} ({type(error).__name__}: {error}) '
                 'and starts anew',
             )
             self.restart()
-            return
-        if stamp is not None:
-            self._note(stamp, queued, time.perf_counter() - begin)
+            return None
 
     def _note(self, stamp: int, queued: Queued, seconds: float) -> None:
         self.step.add(seconds)
