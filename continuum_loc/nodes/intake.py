@@ -209,22 +209,23 @@ class Intake:
             TrackedPose: _names(robot.sensors),
         }
 
-    def accept(self, topic: str, message: Any, arrival: int, now: int) -> Measurement | None:
+    def accept(self, topic: str, message: Any, arrival: int) -> Measurement | None:
         """
         Return the measurement of a message, or None where it is refused.
 
-        A refusal is counted, and reported once per class.
+        arrival: the clock when it came [ns], 0 while a simulated clock has not begun. A refusal is
+        counted, and reported once for its class.
         """
         try:
             measurement = self._checked(topic, message, arrival)
             refusal = self.gate.judge(
-                measurement.stamp, getattr(measurement, 'sensor', topic), now
+                measurement.stamp, getattr(measurement, 'sensor', topic), arrival
             )
             if refusal:
                 raise ConvertError(
                     refusal,
                     f'{topic}: stamp {measurement.stamp / 1e9:.6f} s refused as {refusal} '
-                    f'(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {now / 1e9:.6f} s)',
+                    f'(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {arrival / 1e9:.6f} s)',
                 )
         except ConvertError as error:
             self.refuse(error.kind, str(error))

@@ -19,12 +19,14 @@ from msg_tools.topics import Topic
 import numpy as np
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError  # rclpy gives it no public name
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
 BAD_INPUT = 2
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class PackageNode(Node):
@@ -70,6 +72,10 @@ class PackageNode(Node):
         subscription = self.create_subscription(
             ros_messages().resolve(type_name), topic, take, qos, raw=raw
         )
+
+    def every(self, period: float, action: Callable[[], None]) -> None:
+        """Do `action` each `period` seconds of real time: a simulated clock may stand still."""
+        self.create_timer(period, action, clock=STEADY)
 
     def now(self) -> int:
         """Read the node's clock in integer nanoseconds (0 while simulated time has not begun)."""

@@ -61,7 +61,7 @@ class SimulatorNode(PackageNode):
         self._paced = Paced(self._stamped(), self.settings.lookahead)
         self._shift: int | None = None
         self._thread = threading.Thread(target=self._simulate, name='simulation', daemon=True)
-        self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
 
     def close(self) -> None:

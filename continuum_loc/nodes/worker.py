@@ -107,7 +107,7 @@ class WorkerNode(PackageNode):
                 partial(self._receive, topic),
                 input_qos(spec, self.settings.intake.reliable_inputs),
             )
-        self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
         self.get_logger().info(f"ready: robot '{self.robot.name}'")
 
@@ -192,7 +192,7 @@ class WorkerNode(PackageNode):
 
     def _handle(self, queued: Queued) -> None:
         restarts = self.intake.gate.restarts
-        measurement = self.intake.accept(queued.topic, queued.message, queued.arrival, self.now())
+        measurement = self.intake.accept(queued.topic, queued.message, queued.arrival)
         if self.intake.gate.restarts != restarts:
             self.get_logger().warning(
                 'time went backward: the data starts again, and so does the estimate'
