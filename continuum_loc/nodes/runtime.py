@@ -7,8 +7,10 @@ from collections.abc import Callable
 import json
 import os
 from pathlib import Path
+import signal
 import sys
 import tempfile
+import threading
 from typing import Any
 
 from continuum_loc.nodes.parameters import declare, refuse_unknown
@@ -109,6 +111,7 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         if rclpy.ok():
             return _complain(error)
     finally:
+        _ignore_signals()
         if node is not None:
             node.close()
             node.destroy_node()
@@ -123,6 +126,13 @@ def _spin(node: PackageNode) -> None:
         executor.spin_until_future_complete(node.finished)
     finally:
         executor.remove_node(node)
+
+
+def _ignore_signals() -> None:
+    """Let nothing interrupt the end: a terminal and a launch file may both send their SIGINT."""
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _complain(error: Exception) -> int:
