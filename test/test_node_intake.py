@@ -159,6 +159,16 @@ def test_a_leap_is_believed_only_when_several_agree(leap, restarts):
     assert gate.restarts == restarts
 
 
+def test_topics_torn_apart_by_a_pause_are_late_and_no_new_start():
+    """After 3 s without reception, one sensor's samples all come before the other's."""
+    gate = StampGate(IntakeSettings())
+    stamps = [START + k * SECOND // 100 for k in range(300)]
+    assert {gate.judge(START - 1, sensor, 0) for sensor in ('a', 'b')} == {None}
+    for sensor in ('a', 'b'):
+        assert [gate.judge(stamp, sensor, 0) for stamp in stamps] == [None] * 300
+    assert gate.restarts == 0 and gate.newest == stamps[-1]
+
+
 def test_lone_wild_stamps_never_move_the_clock():
     gate = StampGate(IntakeSettings())
     rng = np.random.default_rng(0)
