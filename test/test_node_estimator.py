@@ -21,7 +21,6 @@ from msg_tools.convert import tracker_message
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
 from node_graph import BoxRobot, Client, fresh_domain, Process, wait_until
-import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter

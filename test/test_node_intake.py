@@ -30,7 +30,6 @@ from continuum_loc.nodes.warm_up import rest_samples
 from continuum_loc.robot import load_robot
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.topics import topic_spec
-import numpy as np
 import pytest
 
 SECOND = 10**9

@@ -219,7 +219,12 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
-        return SlidingWindowFilter(robot, self.prior_map, self.filter_settings)
+        """Make a filter for the graph: no past, which nobody asks it for, and all memory from the start."""
+        settings = self.filter_settings.model_copy(update={'history': 0.0})
+        made = SlidingWindowFilter(robot, self.prior_map, settings)
+        if made.tof is not None:
+            made.tof.index.reserve()
+        return made
 
     def _preset(self) -> EstimatorSettings:
         """Use the settings asked for, else those bundled for this robot, else the library's."""

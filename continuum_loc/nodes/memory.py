@@ -13,11 +13,15 @@ from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.evaluation.tracks import BASE, Track
 from continuum_loc.mapping.anomalies import AnomalySettings, mahalanobis2
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.reconstruct import Reconstruction, reconstruct, RingTrajectory
+from continuum_loc.mapping.reconstruct import reconstruct, Reconstruction, RingTrajectory
+from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import nanoseconds, TofFrame
 from continuum_loc.robot import RobotDescription
 from msg_tools.records import CloudRecord
 import numpy as np
+
+REACH = 0.05  # m, about what a reconstructed point may lie off the map
+CACHE_CELLS = 1 << 13
 
 
 class Trajectory:
@@ -65,7 +69,7 @@ class SeenScene:
         self.duration = duration
         self.skipped = 0  # frames that no smoothed poses span, or that waited for too long
         self._robot, self._prior = robot, prior
-        self._index = None if prior is None else prior.index(reach=0.05)
+        self._index = None if prior is None else _small_index(prior)
         self._search_radius = AnomalySettings().search_radius
         self._frames: list[TofFrame] = []
         self._jobs: deque[tuple[list[TofFrame], RingTrajectory]] = deque()
@@ -149,6 +153,12 @@ class SeenScene:
             self._seen.popleft()
         while self._jobs and self._jobs[0][1].stamps[-1] < oldest:
             self.skipped += len(self._jobs.popleft()[0])
+
+
+def _small_index(prior: PriorMap) -> VoxelIndex:
+    """Index a map for what is looked up once: most points of a cloud never come again."""
+    index = VoxelIndex(prior.points, prior.normals, reach=REACH, cache_cells=CACHE_CELLS)
+    return index.reserve()
 
 
 def _joined(parts: list[np.ndarray], empty: tuple[int, ...] = (0,)) -> np.ndarray:
