@@ -50,7 +50,7 @@ class Mount(Settings):
 
     @cached_property
     def T_ring_sensor(self) -> np.ndarray:
-        """(4, 4) transform from the sensor frame to the ring frame; shared, so not to be written to."""
+        """(4, 4) from the sensor frame to the ring frame; shared, so not to be written to."""
         T_ring_sensor = np.eye(4)
         if self.xyz is not None:
             T_ring_sensor[:3, :3] = Rotation.from_euler(

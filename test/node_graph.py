@@ -33,6 +33,7 @@ from rclpy.node import Node
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 60.0  # s; generous: discovery alone may take seconds, and the machine may be busy
+COMPILING = 240.0  # s; where nothing has been compiled before, and the machine is busy
 _numbers = itertools.count(1 + 7 * os.getpid() % 90)
 
 ROBOT = """
@@ -105,9 +106,9 @@ class Process:
     def log(self) -> str:
         return self.path.read_text(errors='replace')
 
-    def await_log(self, text: str) -> None:
+    def await_log(self, text: str, patience: float = PATIENCE) -> None:
         assert (
-            wait_until(lambda: text in self.log or self.popen.poll() is not None)
+            wait_until(lambda: text in self.log or self.popen.poll() is not None, patience)
             and text in self.log
         ), self.log
 

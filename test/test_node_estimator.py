@@ -20,7 +20,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import tracker_message
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
-from node_graph import BoxRobot, Client, fresh_domain, Process, wait_until
+from node_graph import BoxRobot, Client, COMPILING, fresh_domain, Process, wait_until
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter
@@ -51,7 +51,7 @@ def start(box, folder, domain, *arguments, **parameters):
         **{'intake.max_backlog': 30.0},
         **parameters,
     )
-    node.await_log('ready:')
+    node.await_log('ready:', COMPILING)
     return node
 
 

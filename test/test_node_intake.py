@@ -314,7 +314,7 @@ def test_ten_thousand_bad_messages_are_refused_by_class_and_leave_the_estimates_
 
 
 def _jumbled(items, rng, reach=12):
-    """The items, each within `reach` places of its own."""
+    """Move each item by less than `reach` places."""
     order = np.argsort(np.arange(len(items)) + rng.uniform(0, reach, len(items)), kind='stable')
     return [items[k] for k in order]
 

@@ -10,7 +10,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed')
 
 from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds, TrackedPose
 from msg_tools.bag import BagWriter
-from node_graph import BoxRobot, Client, fresh_domain, Process, wait_until
+from node_graph import BoxRobot, Client, COMPILING, fresh_domain, Process, wait_until
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 pytestmark = pytest.mark.timeout(300)
@@ -45,12 +45,12 @@ def estimator(folder, domain, *arguments, **parameters):
         **{'intake.max_backlog': 30.0},
         **parameters,
     )
-    node.await_log('ready:')
+    node.await_log('ready:', COMPILING)
     return node
 
 
 def test_a_looped_bag_with_its_own_clock_is_estimated_anew_each_time_round(box, tmp_path):
-    """Data of years ago, with use_sim_time and /clock: poses carry the bag's stamps, twice over."""
+    """Data of years ago, with use_sim_time and /clock: poses carry the bag's stamps, twice."""
     stamps = [YESTERDAY + nanoseconds(tick / 15) for tick in range(45)]
     with BagWriter(tmp_path / 'bag') as bag:
         for stamp in stamps:

@@ -1,4 +1,4 @@
-"""What the processes of a live graph take from the machine: memory and processor time, over time."""
+"""Memory and processor time that the processes of a live graph take, over time."""
 
 from __future__ import annotations
 

@@ -713,7 +713,7 @@ class VoxelIndex:
         return twin
 
     def reserve(self) -> VoxelIndex:
-        """Take the cache's memory at once, rather than in the course of a long run; returns self."""
+        """Take the cache's memory at once, not in the course of a long run; return self."""
         self.arrays.pool.fill(0.0)
         return self
 

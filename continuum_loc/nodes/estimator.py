@@ -219,7 +219,7 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
-        """Make a filter for the graph: no past, which nobody asks it for, and all memory from the start."""
+        """Make a filter without a past, which no graph asks for, and with all its memory."""
         settings = self.filter_settings.model_copy(update={'history': 0.0})
         made = SlidingWindowFilter(robot, self.prior_map, settings)
         if made.tof is not None:

@@ -32,7 +32,8 @@ class LiveResult:
     """
     What a live run left behind.
 
-    bag: folder of the recorded bag, None where none was recorded. latency_ms, lag_ms, step_ms: count, mean, p50, p95, p99, max
+    bag: folder of the recorded bag, None where none was recorded.
+    latency_ms, lag_ms, step_ms: count, mean, p50, p95, p99, max
     of the delay from sensor stamp to published pose, from reception to published pose, and of the
     filter step. latencies_s: each latency. counts: per node, what was published, received, used,
     refused, dropped and written.
@@ -132,9 +133,9 @@ def run_live(
     watch: Callable[[dict[str, int]], None] | None = None,
 ) -> LiveResult:
     """
-    Simulate, estimate and record live over real ROS 2, `duration` seconds of data, into
-    `folder`/bag unless told not to `record`.
+    Simulate, estimate and record live over real ROS 2, `duration` seconds of data.
 
+    The bag is `folder`/bag; `record` says whether there is one.
     robot, scene, prior_map, settings: bundled names or files. domain_id: ROS_DOMAIN_ID of the
     private graph (default: one from the process id). progress(stage, share): called as it goes on,
     share in [0, 1]. watch(process ids by node): called ten times a second while data flows. Raises

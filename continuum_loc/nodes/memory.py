@@ -139,7 +139,7 @@ class SeenScene:
         )
 
     def save(self, path: Path) -> None:
-        """Write a `.ply` of all points, new ones (eq. 12) marked; ValueError where there are none."""
+        """Write a `.ply` of all points, new ones (eq. 12) marked; ValueError if there are none."""
         seen = list(self._seen)  # the worker may add meanwhile
         if not any(len(part.points) for _, part, _ in seen):
             raise ValueError('nothing was reconstructed yet')

@@ -13,7 +13,7 @@ import tempfile
 import threading
 from typing import Any
 
-from continuum_loc.nodes.parameters import declare, refuse_unknown
+from continuum_loc.nodes.parameters import declare, guard, live_fields, read, refuse_unknown
 from continuum_loc.settings import Settings, SettingsError
 from msg_tools.errors import BagError, ConvertError
 from msg_tools.factory import ros_messages
@@ -38,6 +38,7 @@ class PackageNode(Node):
         super().__init__(name, **options)
         self.finished = Future()
         self.settings = declare(self, defaults)
+        self._guarded = False
 
     def finish(self) -> None:
         """End the spin of this node (from any thread)."""
@@ -84,8 +85,23 @@ class PackageNode(Node):
         return self.get_clock().now().nanoseconds
 
     def check_parameters(self) -> None:
-        """Refuse parameters that this node does not have; call it when all are declared."""
+        """Refuse strange parameters, and changes that cannot be; call it when all are declared."""
         refuse_unknown(self)
+        if not self._guarded:
+            guard(self, self._change)
+            self._guarded = True
+
+    def live_parameters(self) -> set[str]:
+        """Return the names of the parameters that may change while the node runs."""
+        return live_fields(type(self.settings))
+
+    def _change(self, values: dict[str, Any]) -> str | None:
+        """Take changed parameters, or return the reason why not."""
+        fixed = sorted(set(values) - self.live_parameters())
+        if fixed:
+            return f"'{fixed[0]}' is fixed while the node runs: set it when you start it"
+        self.settings = read(self, type(self.settings), changed=values)
+        return None
 
 
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:

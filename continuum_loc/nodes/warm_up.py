@@ -56,7 +56,7 @@ def warm_up(filter_: Any, scene: SeenScene, robot: RobotDescription, window: flo
     Compile every kernel that `filter_` and `scene` use.
 
     Runs the filter past its first marginalisation, places what would be seen then, and resets the
-    filter. The tube is not what the map shows, so that the search for a lost body runs, and compiles, too.
+    filter. The tube is not what the map shows, so that the search for a lost body compiles too.
     """
     made = [filter_.process(sample) for sample in rest_samples(robot, 1.3 * window + 0.3)]
     estimate = next((one for one in reversed(made) if one is not None), None)

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from continuum_loc.measurements import Measurement, NANOSECONDS
 from continuum_loc.nodes.intake import Inbox, Intake, Queued
-from continuum_loc.nodes.parameters import guard, live_fields, read
+from continuum_loc.nodes.parameters import live_fields
 from continuum_loc.nodes.runtime import Delays, input_qos, output_qos, PackageNode, write_summary
 from continuum_loc.nodes.settings import IntakeSettings
 from continuum_loc.robot import load_robot
@@ -98,7 +98,6 @@ class WorkerNode(PackageNode):
     def begin(self) -> None:
         """Subscribe and start to work: call it when everything is ready for data."""
         self.check_parameters()
-        guard(self, self._change)
         for topic in self._input_topics():
             spec = topic_spec(topic)
             self.listen(
@@ -228,18 +227,17 @@ class WorkerNode(PackageNode):
 
     # ------------------------------------------------ parameters, diagnostics
 
+    def live_parameters(self) -> set[str]:
+        """Return those of the node and of its intake."""
+        intake = {f'intake.{name}' for name in live_fields(IntakeSettings)}
+        return super().live_parameters() | intake
+
     def _change(self, values: dict[str, Any]) -> str | None:
-        live = live_fields(type(self.settings)) | {
-            f'intake.{name}' for name in live_fields(IntakeSettings)
-        }
-        fixed = sorted(set(values) - live)
-        if fixed:
-            return f"'{fixed[0]}' is fixed while the node runs: set it when you start it"
-        self.settings = read(self, type(self.settings), changed=values)
+        reason = super()._change(values)
         self.inbox.settings = self.intake.settings = self.intake.gate.settings = (
             self.settings.intake
         )
-        return None
+        return reason
 
     def _report(self, kind: str, text: str) -> None:
         self.get_logger().warning(f"{text} [further cases of '{kind}' are only counted]")

@@ -82,7 +82,7 @@ def soak(out: Path, duration: float, seed: int) -> list[Claim]:
 
 
 def swaying(motion: Trajectory, duration: float) -> TrajectoryFile:
-    """`motion` forth and back again for at least `duration` seconds, without a jump in anything."""
+    """Repeat `motion` forth and back for at least `duration` seconds, without any jump."""
     steps = np.diff(motion.times)
     there = [*range(1, len(motion.times))]
     back = [*range(len(motion.times) - 2, -1, -1)]
