@@ -5,7 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'continuum_loc'
-NODES = ('simulator', 'estimator', 'shape', 'recorder', 'replayer', 'viewer')
+NODES = ('simulator', 'estimator', 'shape', 'recorder', 'replayer', 'driver', 'viewer')
 HERE = Path(__file__).parent
 
 
@@ -58,6 +58,7 @@ setup(
         'jinja2',
         'plotly',
         'matplotlib',
+        'psutil',
         'pillow',
     ],
     extras_require={

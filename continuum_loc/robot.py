@@ -48,9 +48,9 @@ class Mount(Settings):
             raise ValueError('give either both azimuth_deg and radius, or both xyz and rpy_deg')
         return self
 
-    @property
+    @cached_property
     def T_ring_sensor(self) -> np.ndarray:
-        """(4, 4) transform from the sensor frame to the ring frame."""
+        """(4, 4) from the sensor frame to the ring frame; shared, so not to be written to."""
         T_ring_sensor = np.eye(4)
         if self.xyz is not None:
             T_ring_sensor[:3, :3] = Rotation.from_euler(

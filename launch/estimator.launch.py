@@ -27,6 +27,7 @@ ARGUMENTS = (
     ('bag', '', 'bag to play; empty waits for live sensors'),
     ('rate', '1.0', 'speed of the bag relative to the recording'),
     ('rviz', 'false', 'start RViz'),
+    ('viewer', 'false', 'serve a page to watch in a browser, at http://127.0.0.1:8765/'),
     (
         'params_file',
         PathJoinSubstitution([SHARE, 'config', 'estimator.yaml']),
@@ -69,9 +70,13 @@ def generate_launch_description():
         ],
         **common,
     )
+    viewer = Node(
+        executable='viewer', name='viewer', condition=IfCondition(arg('viewer')), **common
+    )
     rviz = Node(
         package='rviz2',
         executable='rviz2',
+        namespace=arg('namespace'),
         condition=IfCondition(arg('rviz')),
         arguments=['-d', PathJoinSubstitution([SHARE, 'rviz', 'continuum_loc.rviz'])],
     )
@@ -84,4 +89,4 @@ def generate_launch_description():
         DeclareLaunchArgument(name, default_value=value, description=text)
         for name, value, text in ARGUMENTS
     ]
-    return LaunchDescription([*declared, estimator, replayer, rviz, end])
+    return LaunchDescription([*declared, estimator, replayer, viewer, rviz, end])

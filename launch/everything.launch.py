@@ -1,5 +1,5 @@
 """
-Everything at once: live simulation, estimator, recorder and RViz.
+Everything at once: live simulation, estimator, recorder, RViz and a page for a browser.
 
 ros2 launch continuum_loc everything.launch.py map:=S0.npz
 """
@@ -18,6 +18,7 @@ ARGUMENTS = (
     ('map', '', 'prior map for the estimator: npz, PLY, PCD, XYZ, CSV or a mesh'),
     ('bag', 'everything', 'folder of the bag to record; empty records none'),
     ('rviz', 'true', 'start RViz'),
+    ('viewer', 'true', 'serve a page to watch in a browser, at http://127.0.0.1:8765/'),
     (
         'params_file',
         PathJoinSubstitution([SHARE, 'config', 'estimator.yaml']),
@@ -28,7 +29,7 @@ ARGUMENTS = (
 
 
 def generate_launch_description():
-    """`live.launch.py` with recorder and RViz switched on."""
+    """`live.launch.py` with recorder, RViz and viewer switched on."""
     declared = [
         DeclareLaunchArgument(name, default_value=value, description=text)
         for name, value, text in ARGUMENTS

@@ -29,6 +29,7 @@ ARGUMENTS = (
     ('map', '', 'prior map for the estimator: npz, PLY, PCD, XYZ, CSV or a mesh'),
     ('bag', '', 'folder of a bag to record; empty records none'),
     ('rviz', 'false', 'start RViz'),
+    ('viewer', 'false', 'serve a page to watch in a browser, at http://127.0.0.1:8765/'),
     (
         'params_file',
         PathJoinSubstitution([SHARE, 'config', 'estimator.yaml']),
@@ -83,9 +84,13 @@ def generate_launch_description():
         condition=IfCondition(NotSubstitution(EqualsSubstitution(arg('bag'), ''))),
         **common,
     )
+    viewer = Node(
+        executable='viewer', name='viewer', condition=IfCondition(arg('viewer')), **common
+    )
     rviz = Node(
         package='rviz2',
         executable='rviz2',
+        namespace=arg('namespace'),
         condition=IfCondition(arg('rviz')),
         arguments=['-d', PathJoinSubstitution([SHARE, 'rviz', 'continuum_loc.rviz'])],
     )
@@ -99,4 +104,4 @@ def generate_launch_description():
         DeclareLaunchArgument(name, default_value=value, description=text)
         for name, value, text in ARGUMENTS
     ]
-    return LaunchDescription([*declared, recorder, estimator, simulator, rviz, end])
+    return LaunchDescription([*declared, recorder, estimator, simulator, viewer, rviz, end])

@@ -25,6 +25,7 @@ ARGUMENTS = (
     ('simulate', 'false', 'simulate the arm'),
     ('trajectory', 'free1', 'named motion of the simulated arm'),
     ('rviz', 'false', 'start RViz'),
+    ('viewer', 'false', 'serve a page to watch in a browser, at http://127.0.0.1:8765/'),
     (
         'params_file',
         PathJoinSubstitution([SHARE, 'config', 'shape.yaml']),
@@ -76,9 +77,13 @@ def generate_launch_description():
         ],
         **common,
     )
+    viewer = Node(
+        executable='viewer', name='viewer', condition=IfCondition(arg('viewer')), **common
+    )
     rviz = Node(
         package='rviz2',
         executable='rviz2',
+        namespace=arg('namespace'),
         condition=IfCondition(arg('rviz')),
         arguments=['-d', PathJoinSubstitution([SHARE, 'rviz', 'continuum_loc.rviz'])],
     )
@@ -86,4 +91,4 @@ def generate_launch_description():
         DeclareLaunchArgument(name, default_value=value, description=text)
         for name, value, text in ARGUMENTS
     ]
-    return LaunchDescription([*declared, shape, replayer, simulator, rviz])
+    return LaunchDescription([*declared, shape, replayer, simulator, viewer, rviz])

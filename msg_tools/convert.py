@@ -211,7 +211,8 @@ def tof_frame(message: Any, where: str = 'tof/points') -> TofFrame:
             f'{where}: no field {", ".join(missing)}; needed: x, y, z, and if known range, '
             f'sigma, status; got: {", ".join(array.dtype.names) or "none"}',
         )
-    points = np.column_stack([array[name] for name in 'xyz']).astype(float)
+    with np.errstate(invalid='ignore'):  # signalling NaNs, as a wrong byte order makes them
+        points = np.column_stack([array[name] for name in 'xyz']).astype(float)
     ranges = _tof_ranges(array, points, where)
     finite = np.isfinite(ranges)
     sigma = (

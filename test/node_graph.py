@@ -6,12 +6,13 @@ Nodes as processes on a graph of their own, and a client that talks to them.
 
 from __future__ import annotations
 
-import itertools
+import fcntl
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 from continuum_loc.measurements import (
@@ -33,7 +34,8 @@ from rclpy.node import Node
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 60.0  # s; generous: discovery alone may take seconds, and the machine may be busy
-_numbers = itertools.count(1 + 7 * os.getpid() % 90)
+COMPILING = 240.0  # s; where nothing has been compiled before, and the machine is busy
+_held: list = []
 
 ROBOT = """
 name: stub
@@ -57,8 +59,17 @@ MATCHED = 0.5
 
 
 def fresh_domain() -> int:
-    """Take a ROS_DOMAIN_ID that no other test of this run has."""
-    return 1 + next(_numbers) % 100
+    """Return a ROS_DOMAIN_ID that no other test has, of this run or of another on this machine."""
+    for number in range(1, 102):
+        lock = Path(tempfile.gettempdir(), f'continuum_loc_domain_{number}.lock').open('w')
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            continue
+        _held.append(lock)  # until this run ends
+        return number
+    raise RuntimeError('all 101 ROS domains are taken by other test runs')
 
 
 def wait_until(condition, patience: float = PATIENCE, step=lambda: time.sleep(0.02)) -> bool:
@@ -105,9 +116,9 @@ class Process:
     def log(self) -> str:
         return self.path.read_text(errors='replace')
 
-    def await_log(self, text: str) -> None:
+    def await_log(self, text: str, patience: float = PATIENCE) -> None:
         assert (
-            wait_until(lambda: text in self.log or self.popen.poll() is not None)
+            wait_until(lambda: text in self.log or self.popen.poll() is not None, patience)
             and text in self.log
         ), self.log
 

@@ -7,7 +7,7 @@ A straight Hall + IMU arm at rest, then bent, from the analytic simulation.
 import signal
 
 from continuum_loc.robot import load_robot
-from node_graph import Client, fresh_domain, Process
+from node_graph import Client, COMPILING, fresh_domain, Process
 import numpy as np
 import pytest
 from std_srvs.srv import Trigger
@@ -19,7 +19,7 @@ OUTPUTS = ('shape/poses', 'shape/curve', '/diagnostics')
 def test_the_simulated_arm_is_followed_live(tmp_path):
     domain = fresh_domain()
     node = Process('shape', domain, tmp_path, diagnostics_rate=5)
-    node.await_log('ready:')
+    node.await_log('ready:', COMPILING)
     robot = load_robot('hall_arm')
     with Client(domain) as client:
         for topic in (*OUTPUTS, 'ground_truth/poses'):

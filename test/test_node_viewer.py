@@ -29,7 +29,8 @@ def test_the_browser_gets_what_is_published(tmp_path):
         get('../settings.py')
     rng = np.random.default_rng(0)
     T = lie.exp(rng.normal(size=(4, 6)))
-    cloud = CloudRecord(1, {name: rng.normal(size=200) for name in ('x', 'y', 'z')})
+    columns = {name: rng.normal(size=200) for name in ('x', 'y', 'z')}
+    cloud = CloudRecord(1, columns | {'anomaly': np.where(np.arange(200) < 30, np.inf, 1.0)})
     with Client(domain) as client:
         items = {
             'poses': PosesRecord(1, T),
@@ -55,4 +56,5 @@ def test_the_browser_gets_what_is_published(tmp_path):
     )
     assert state['status'] == [[2, 'estimator: lost']]
     assert len(points['x']) == 50 and len(state['reconstruction']['x']) == 200
+    assert len(state['new']['x']) == 30
     assert node.stop() == 0, node.log

@@ -31,7 +31,7 @@ ROS = (
     'launch_ros',
 )
 HEAVY = ('open3d', 'mujoco', 'trimesh', 'matplotlib', 'plotly', 'pandas', 'rosbags')
-NODES = ('simulator', 'estimator', 'shape', 'recorder', 'replayer', 'viewer')
+NODES = ('simulator', 'estimator', 'shape', 'recorder', 'replayer', 'driver', 'viewer')
 
 
 def _modules(skip=('nodes',)):

@@ -108,6 +108,19 @@ class Reconstruction:
     skipped: int = 0
     on_body: int = 0
 
+    @classmethod
+    def joined(cls, parts: Sequence[Reconstruction]) -> Reconstruction:
+        """One of several reconstructions by the same robot, in their order."""
+        arrays = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name, value in vars(parts[0]).items()
+            if isinstance(value, np.ndarray)
+        }
+        counts = {
+            name: sum(getattr(part, name) for part in parts) for name in ('skipped', 'on_body')
+        }
+        return cls(**arrays, sensors=parts[0].sensors, **counts)
+
     @property
     def sigma(self) -> np.ndarray:
         """(N,) root mean square over the axes of each point's standard deviation [m]."""

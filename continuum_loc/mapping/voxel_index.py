@@ -712,6 +712,11 @@ class VoxelIndex:
         twin.arrays = self.arrays._replace(cell_slots=cell_slots, pool=pool)
         return twin
 
+    def reserve(self) -> VoxelIndex:
+        """Take the cache's memory at once, not in the course of a long run; return self."""
+        self.arrays.pool.fill(0.0)
+        return self
+
     @property
     def cache_use(self) -> dict[str, int]:
         """

@@ -45,7 +45,7 @@ class EstimatorNode(WorkerNode):
         self.filter = self._new_filter(self.robot)
         self.estimate: Estimate | None = None
         self.trajectory = Trajectory(self.settings.trajectory_seconds)
-        self.scene = SeenScene(self.robot)
+        self.scene = SeenScene(self.robot, self.prior_map, self.settings.reconstruction_seconds)
         self._insertion = 0.0
         self._scene_published = 0
         self._warm_up()
@@ -62,7 +62,7 @@ class EstimatorNode(WorkerNode):
 
     def consume(self, measurement: Measurement) -> int | None:
         """One measurement through the filter; publish the estimate when a step fell due."""
-        if isinstance(measurement, TofFrame) and self.settings.reconstruction_seconds > 0.0:
+        if isinstance(measurement, TofFrame):
             self.scene.see(measurement)
         if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
             self._insertion = float(measurement.position[measurement.names.index('insertion')])
@@ -71,6 +71,16 @@ class EstimatorNode(WorkerNode):
             return None
         self._publish(estimate)
         return estimate.stamp
+
+    def idle(self) -> bool:
+        """Place what the ToF sensors saw an instant ago, and publish it when it is due."""
+        if not self.scene.work():
+            return False
+        since = self.scene.stamp - self._scene_published
+        if not 0 <= since < nanoseconds(1.0 / self.settings.reconstruction_rate):
+            self._scene_published = self.scene.stamp
+            self.publish('reconstruction', self.scene.record())
+        return True
 
     def restart(self) -> None:
         """Start anew from the base, as after ~/reset."""
@@ -126,15 +136,9 @@ class EstimatorNode(WorkerNode):
         if self.frames is not None and self.settings.publish_tf:
             self.frames.send(estimate.stamp, estimate.T_map_ring)
         self.trajectory.add(estimate)
-        self.scene.place(estimate, self.settings.reconstruction_seconds)
-        due = estimate.stamp - self._scene_published >= nanoseconds(
-            1.0 / self.settings.reconstruction_rate
-        )
-        if self.settings.reconstruction_seconds > 0.0 and (
-            due or estimate.stamp < self._scene_published
-        ):
-            self._scene_published = estimate.stamp
-            self.publish('reconstruction', self.scene.record(estimate.stamp))
+        smoothed = estimate.lagged if self.filter_settings.lag > 0.0 else estimate
+        if smoothed is not None:
+            self.scene.follow(smoothed)
 
     def _publish_map(self) -> None:
         if self.prior_map is None:
@@ -165,11 +169,8 @@ class EstimatorNode(WorkerNode):
         return 'the estimate starts anew with the next sample'
 
     def _save_map(self) -> str:
-        points = self.scene.columns()
-        if not len(points):
-            raise ValueError('nothing was reconstructed yet')
-        path = self._output('reconstruction.csv')
-        np.savetxt(path, points[:, :3], delimiter=',', header='x,y,z', comments='', fmt='%.6f')
+        path = self._output('reconstruction.ply')
+        self.scene.save(path)
         return str(path)
 
     def _save_trajectory(self) -> str:
@@ -206,7 +207,9 @@ class EstimatorNode(WorkerNode):
             )
             self.in_worker(lambda: self._rebuild(self.robot))
         rest = {name: value for name, value in values.items() if name not in mine}
-        return super()._change(rest) if rest else None
+        reason = super()._change(rest) if rest else None
+        self.scene.duration = self.settings.reconstruction_seconds
+        return reason
 
     def _rebuild(self, robot: RobotDescription) -> None:
         self.robot = robot
@@ -216,7 +219,12 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
-        return SlidingWindowFilter(robot, self.prior_map, self.filter_settings)
+        """Make a filter without a past, which no graph asks for, and with all its memory."""
+        settings = self.filter_settings.model_copy(update={'history': 0.0})
+        made = SlidingWindowFilter(robot, self.prior_map, settings)
+        if made.tof is not None:
+            made.tof.index.reserve()
+        return made
 
     def _preset(self) -> EstimatorSettings:
         """Use the settings asked for, else those bundled for this robot, else the library's."""
@@ -239,7 +247,7 @@ class EstimatorNode(WorkerNode):
     def _warm_up(self) -> None:
         if self.settings.warm_up:
             self.get_logger().info('compiling, or loading what an earlier run compiled')
-            warm_up(self.filter, self.robot, self.filter_settings.window)
+            warm_up(self.filter, self.scene, self.robot, self.filter_settings.window)
             self.filter = self._new_filter(self.robot)
 
 

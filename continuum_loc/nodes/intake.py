@@ -133,12 +133,12 @@ class StampGate:
     """
     Rules for stamps.
 
-    `judge` returns None to use a sample, or the class of error under which it is refused.
-
-    A leap beyond the tolerance is believed when `jump_confirmations` samples agree on it and none
-    came meanwhile that
-    does not leap: forward it is a gap, backward the data starts again (`restarts` counts those),
-    as a looped bag does.
+    `judge` returns None to use a sample, or the class of error under which it is refused. A sample
+    that follows the last one of its own sensor is late, however far the others are: after a pause
+    of the whole process, reception takes one topic after the other. A leap from both is believed
+    when `jump_confirmations` samples agree on it and none came meanwhile that does not leap:
+    forward it is a gap, backward the data starts again (`restarts` counts those), as a looped bag
+    does.
     """
 
     def __init__(self, settings: IntakeSettings) -> None:
@@ -158,7 +158,7 @@ class StampGate:
             return 'zero stamp'
         if now and stamp > now + nanoseconds(self.settings.future_tolerance):
             return 'future stamp'
-        if self._leaps(stamp) and not self._believed(stamp):
+        if self._leaps(stamp, sensor) and not self._believed(stamp):
             return 'leap'
         self._leaping.clear()
         seen = self._seen.setdefault(sensor, deque(maxlen=64))
@@ -168,10 +168,11 @@ class StampGate:
         self.newest = stamp if self.newest is None else max(stamp, self.newest)
         return None
 
-    def _leaps(self, stamp: int) -> bool:
-        return self.newest is not None and abs(stamp - self.newest) > nanoseconds(
-            self.settings.jump_tolerance
-        )
+    def _leaps(self, stamp: int, sensor: str) -> bool:
+        """Whether a stamp follows neither the newest of all nor the last of its own sensor."""
+        known = [self.newest, *list(self._seen.get(sensor, ()))[-1:]]
+        tolerance = nanoseconds(self.settings.jump_tolerance)
+        return self.newest is not None and all(abs(stamp - one) > tolerance for one in known)
 
     def _believed(self, stamp: int) -> bool:
         tolerance = nanoseconds(self.settings.jump_tolerance)
@@ -209,22 +210,23 @@ class Intake:
             TrackedPose: _names(robot.sensors),
         }
 
-    def accept(self, topic: str, message: Any, arrival: int, now: int) -> Measurement | None:
+    def accept(self, topic: str, message: Any, arrival: int) -> Measurement | None:
         """
         Return the measurement of a message, or None where it is refused.
 
-        A refusal is counted, and reported once per class.
+        arrival: the clock when it came [ns], 0 while a simulated clock has not begun. A refusal is
+        counted, and reported once for its class.
         """
         try:
             measurement = self._checked(topic, message, arrival)
             refusal = self.gate.judge(
-                measurement.stamp, getattr(measurement, 'sensor', topic), now
+                measurement.stamp, getattr(measurement, 'sensor', topic), arrival
             )
             if refusal:
                 raise ConvertError(
                     refusal,
                     f'{topic}: stamp {measurement.stamp / 1e9:.6f} s refused as {refusal} '
-                    f'(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {now / 1e9:.6f} s)',
+                    f'(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {arrival / 1e9:.6f} s)',
                 )
         except ConvertError as error:
             self.refuse(error.kind, str(error))

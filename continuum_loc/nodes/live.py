@@ -32,14 +32,15 @@ class LiveResult:
     """
     What a live run left behind.
 
-    bag: folder of the recorded bag. latency_ms, lag_ms, step_ms: count, mean, p50, p95, p99, max
+    bag: folder of the recorded bag, None where none was recorded.
+    latency_ms, lag_ms, step_ms: count, mean, p50, p95, p99, max
     of the delay from sensor stamp to published pose, from reception to published pose, and of the
     filter step. latencies_s: each latency. counts: per node, what was published, received, used,
     refused, dropped and written.
     lost: messages that were published but never reached the estimator or the bag, by topic.
     """
 
-    bag: Path
+    bag: Path | None
     latency_ms: dict[str, float]
     lag_ms: dict[str, float]
     step_ms: dict[str, float]
@@ -69,6 +70,10 @@ class _Process:
                 env=environment,
                 start_new_session=True,
             )
+
+    @property
+    def pid(self) -> int:
+        return self._popen.pid
 
     def running(self) -> bool:
         """Whether it runs; raises LiveError where it failed."""
@@ -123,16 +128,18 @@ def run_live(
     tof_fidelity: str = 'paper',
     settings: str = '',
     domain_id: int | None = None,
+    record: bool = True,
     progress: Callable[[str, float], None] | None = None,
+    watch: Callable[[dict[str, int]], None] | None = None,
 ) -> LiveResult:
     """
-    Simulate, estimate and record live over real ROS 2 into `folder`/bag.
+    Simulate, estimate and record live over real ROS 2, `duration` seconds of data.
 
-    For `duration` seconds of data.
-
+    The bag is `folder`/bag; `record` says whether there is one.
     robot, scene, prior_map, settings: bundled names or files. domain_id: ROS_DOMAIN_ID of the
     private graph (default: one from the process id). progress(stage, share): called as it goes on,
-    share in [0, 1]. Raises LiveError where a node fails; no process is left behind.
+    share in [0, 1]. watch(process ids by node): called ten times a second while data flows. Raises
+    LiveError where a node fails; no process is left behind.
     """
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
@@ -140,6 +147,7 @@ def run_live(
     environment = _environment(domain_id)
     common = {'robot': robot}
     started: list[_Process] = []
+    listeners: list[_Process] = []
 
     def start(node: str, **parameters: Any) -> _Process:
         path = folder / f'{node}.json'
@@ -152,7 +160,8 @@ def run_live(
     try:
         tell('starting the nodes', 0.0)
         # The simulator publishes reliably, so on a busy machine nothing need be lost on the way.
-        recorder = start('recorder', bag=str(folder / 'bag'), reliable_inputs=True)
+        if record:
+            listeners.append(start('recorder', bag=str(folder / 'bag'), reliable_inputs=True))
         estimator = start(
             'estimator',
             map=str(prior_map),
@@ -160,9 +169,11 @@ def run_live(
             **{'intake.reliable_inputs': True},
             **common,
         )
-        recorder.await_log('recording', START_LIMIT)
+        for recorder in listeners:
+            recorder.await_log('recording', START_LIMIT)
         estimator.await_log('ready:', START_LIMIT)
-        # The simulator holds its data back until estimator and recorder both listen to it.
+        listeners.append(estimator)
+        # The simulator holds its data back until all of them listen to it.
         simulator = start(
             'simulator',
             scene=scene,
@@ -171,25 +182,27 @@ def run_live(
             seed=seed,
             profile=profile,
             tof_fidelity=tof_fidelity,
-            wait_for=2,
+            wait_for=len(listeners),
             **common,
         )
-        _follow(simulator, (recorder, estimator), duration, tell)
+        _follow(simulator, listeners, duration, tell, watch)
         time.sleep(0.5)  # the last estimate is still on its way into the bag
-        for process in (simulator, estimator, recorder):
+        for process in (simulator, *reversed(listeners)):
             process.stop()
     finally:
         for process in started:
             process.kill()
-    return _result(folder, tuple(process.log for process in started))
+    return _result(folder, record, tuple(process.log for process in started))
 
 
 def _follow(
     simulator: _Process,
-    others: tuple[_Process, ...],
+    others: list[_Process],
     duration: float,
     tell: Callable[[str, float], None],
+    watch: Callable[[dict[str, int]], None] | None,
 ) -> None:
+    ids = {process.node: process.pid for process in (simulator, *others)}
     begin: float | None = None
     while simulator.running():
         for process in others:
@@ -201,6 +214,8 @@ def _follow(
             begin = time.monotonic()
         if begin is not None:
             tell('live', min((time.monotonic() - begin) / duration, 1.0))
+            if watch is not None:
+                watch(ids)
         time.sleep(POLL)
     tell('live', 1.0)
 
@@ -229,33 +244,33 @@ def _yaml(value: Any) -> str:
     return json.dumps(value)
 
 
-def _result(folder: Path, logs: tuple[Path, ...]) -> LiveResult:
-    read = {
-        node: json.loads((folder / f'{node}.json').read_text())
-        for node in ('simulator', 'estimator', 'recorder')
-    }
-    estimator = read['estimator']
-    published, received = read['simulator']['published'], estimator['counts']['received']
-    written = read['recorder']['written']
-    lost = {f'{topic} -> bag': count - written.get(topic, 0) for topic, count in published.items()}
-    lost |= {
-        f'{topic} -> estimator': count - received.get(topic, 0)
-        for topic, count in published.items()
-        if topic != 'ground_truth/poses'
-    }
+def _result(folder: Path, recorded: bool, logs: tuple[Path, ...]) -> LiveResult:
+    read = {log.stem: json.loads(log.with_suffix('.json').read_text()) for log in logs}
+    estimator, published = read['estimator'], read['simulator']['published']
+    sensors = {topic: count for topic, count in published.items() if topic != 'ground_truth/poses'}
+    lost = _missing('estimator', sensors, estimator['counts']['received'])
     counts = {
         'simulator': {'published': published, 'delay_ms': read['simulator']['delay_ms']},
         'estimator': estimator['counts'],
         'filter': estimator['filter'],
-        'recorder': {'written': written},
     }
+    if recorded:
+        written = read['recorder']['written']
+        lost = _missing('bag', published, written) | lost
+        counts['recorder'] = {'written': written}
     return LiveResult(
-        bag=folder / 'bag',
+        bag=folder / 'bag' if recorded else None,
         latency_ms=estimator['latency_ms'],
         lag_ms=estimator['lag_ms'],
         step_ms=estimator['step_ms'],
         latencies_s=estimator['latencies_s'],
         counts=counts,
-        lost={where: count for where, count in lost.items() if count},
+        lost=lost,
         logs=logs,
     )
+
+
+def _missing(where: str, sent: dict[str, int], came: dict[str, int]) -> dict[str, int]:
+    """How many of the messages of each topic never came; topics of which all came are left out."""
+    missing = {topic: count - came.get(topic, 0) for topic, count in sent.items()}
+    return {f'{topic} -> {where}': count for topic, count in missing.items() if count}

@@ -7,13 +7,21 @@ The newest trajectory, and the scene it saw.
 from __future__ import annotations
 
 from collections import deque
+from pathlib import Path
 
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.evaluation.tracks import BASE, Track
+from continuum_loc.mapping.anomalies import AnomalySettings, mahalanobis2
+from continuum_loc.mapping.prior_map import PriorMap
+from continuum_loc.mapping.reconstruct import reconstruct, Reconstruction, RingTrajectory
+from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import nanoseconds, TofFrame
 from continuum_loc.robot import RobotDescription
 from msg_tools.records import CloudRecord
 import numpy as np
+
+REACH = 0.05  # m, about what a reconstructed point may lie off the map
+CACHE_CELLS = 1 << 13
 
 
 class Trajectory:
@@ -49,75 +57,109 @@ class Trajectory:
 
 
 class SeenScene:
-    """ToF points placed in `map` by the estimate, for the newest `duration` seconds."""
+    """
+    What the ToF sensors met in the newest `duration` seconds, placed in the map.
 
-    def __init__(self, robot: RobotDescription) -> None:
-        self._ring = {sensor.name: 1 + robot.ring_names.index(sensor.ring) for sensor in robot.tof}
-        self._T_ring_sensor = {sensor.name: sensor.mount.T_ring_sensor for sensor in robot.tof}
-        self._waiting: list[TofFrame] = []
-        self._seen: deque[tuple[int, np.ndarray]] = deque()
+    Points with covariance (paper, eqs. 10-11) and their distance to the prior map (eq. 12). A
+    frame waits until smoothed poses span its time. `work` then places one instant at a time, so
+    that its caller decides when there is leisure for it.
+    """
+
+    def __init__(self, robot: RobotDescription, prior: PriorMap | None, duration: float) -> None:
+        self.duration = duration
+        self.skipped = 0  # frames that no smoothed poses span, or that waited for too long
+        self._robot, self._prior = robot, prior
+        self._index = None if prior is None else _small_index(prior)
+        self._search_radius = AnomalySettings().search_radius
+        self._frames: list[TofFrame] = []
+        self._jobs: deque[tuple[list[TofFrame], RingTrajectory]] = deque()
+        self._seen: deque[tuple[int, Reconstruction, np.ndarray]] = deque()
+        self._last: Estimate | None = None
 
     def see(self, frame: TofFrame) -> None:
-        """Keep a frame that the next estimate places."""
-        self._waiting.append(frame)
+        """Take a frame that later poses will place; nothing is kept where `duration` is 0."""
+        if self.duration > 0.0:
+            self._frames.append(frame)
 
-    def place(self, estimate: Estimate, duration: float) -> None:
-        """
-        Place the waiting frames by an estimate made at their instant.
+    def follow(self, smoothed: Estimate) -> None:
+        """Take the next smoothed poses: what was seen up to their time can be placed."""
+        last, self._last = self._last, smoothed
+        if last is None or smoothed.stamp <= last.stamp:
+            last = smoothed
+        past = [frame for frame in self._frames if frame.stamp <= smoothed.stamp]
+        spanned = [frame for frame in past if frame.stamp >= last.stamp]
+        self._frames = [frame for frame in self._frames if frame.stamp > smoothed.stamp]
+        if {last.status, smoothed.status} != {'tracking'}:
+            spanned = []
+        self.skipped += len(past) - len(spanned)
+        if spanned:
+            poses = [smoothed] if last is smoothed else [last, smoothed]
+            self._jobs.append((spanned, RingTrajectory.of_estimates(poses)))
+        self._forget(smoothed.stamp)
 
-        What is older than `duration` [s] is forgotten.
-        """
-        frames = [
-            frame
-            for frame in self._waiting
-            if abs(frame.stamp - estimate.stamp) < nanoseconds(0.005)
-        ]
-        self._waiting = []
-        if frames and estimate.status == 'tracking':
-            self._seen.append(
-                (
-                    estimate.stamp,
-                    np.concatenate([self._placed(frame, estimate) for frame in frames]),
-                )
-            )
-        while self._seen and self._seen[0][0] < estimate.stamp - nanoseconds(duration):
-            self._seen.popleft()
+    def work(self) -> bool:
+        """Place the oldest instant that can be; False where there is none."""
+        if not self._jobs:
+            return False
+        frames, trajectory = self._jobs.popleft()
+        self._seen.append((int(trajectory.stamps[-1]), *self.placed(frames, trajectory)))
+        return True
+
+    def placed(
+        self, frames: list[TofFrame], trajectory: RingTrajectory
+    ) -> tuple[Reconstruction, np.ndarray]:
+        """Place N points; with their Mahalanobis distance (N,) to the map, NaN without a map."""
+        points = reconstruct(self._robot, frames, trajectory)
+        if self._prior is None:
+            return points, np.full(len(points.points), np.nan)
+        squared, _ = mahalanobis2(points, self._prior, self._search_radius, self._index)
+        return points, np.sqrt(squared)
 
     def clear(self) -> None:
         """Forget everything."""
-        self._waiting = []
+        self._last, self._frames = None, []
+        self._jobs.clear()
         self._seen.clear()
 
-    def columns(self) -> np.ndarray:
-        """(N, 4) x, y, z in `map` and standard deviation [m]."""
-        return np.concatenate([np.empty((0, 4)), *(points for _, points in list(self._seen))])
+    @property
+    def stamp(self) -> int:
+        """Of the newest instant that was placed [ns]; 0 where there is none."""
+        return self._seen[-1][0] if self._seen else 0
 
-    def record(self, stamp: int, anomaly: np.ndarray | None = None) -> CloudRecord:
-        """Return the points as the `reconstruction` topic carries them."""
-        x, y, z, sigma = self.columns().T
+    def record(self) -> CloudRecord:
+        """All points as the `reconstruction` topic carries them."""
+        seen = list(self._seen)
         return CloudRecord(
-            stamp,
-            {
-                'x': x,
-                'y': y,
-                'z': z,
-                'sigma': sigma,
-                'anomaly': np.zeros_like(x) if anomaly is None else anomaly,
+            self.stamp,
+            dict(zip('xyz', _joined([part.points for _, part, _ in seen], (0, 3)).T, strict=True))
+            | {
+                'sigma': _joined([part.sigma for _, part, _ in seen]),
+                'anomaly': _joined([anomaly for *_, anomaly in seen]),
             },
         )
 
-    def _placed(self, frame: TofFrame, estimate: Estimate) -> np.ndarray:
-        """
-        (N, 4) of the zones with a return.
+    def save(self, path: Path) -> None:
+        """Write a `.ply` of all points, new ones (eq. 12) marked; ValueError if there are none."""
+        seen = list(self._seen)  # the worker may add meanwhile
+        if not any(len(part.points) for _, part, _ in seen):
+            raise ValueError('nothing was reconstructed yet')
+        whole = Reconstruction.joined([part for _, part, _ in seen])
+        new = _joined([anomaly for *_, anomaly in seen]) ** 2 > AnomalySettings().tau
+        whole.save(path, None if self._prior is None else new)
 
-        The standard deviation is the beam's and the ring's together, eq. 11.
-        """
-        ring = self._ring[frame.sensor]
-        T_map_sensor = estimate.T_map_ring[ring] @ self._T_ring_sensor[frame.sensor]
-        valid = np.isfinite(frame.ranges)
-        points = frame.points[valid] @ T_map_sensor[:3, :3].T + T_map_sensor[:3, 3]
-        beam = np.nan_to_num(frame.sigma[valid], nan=0.0)
-        position = np.trace(estimate.covariance[ring, :3, :3]) / 3.0
-        rotation = np.trace(estimate.covariance[ring, 3:, 3:]) / 3.0
-        sigma = np.sqrt(beam**2 + position + rotation * frame.ranges[valid] ** 2)
-        return np.column_stack([points, sigma])
+    def _forget(self, now: int) -> None:
+        oldest = now - nanoseconds(self.duration)
+        while self._seen and self._seen[0][0] < oldest:
+            self._seen.popleft()
+        while self._jobs and self._jobs[0][1].stamps[-1] < oldest:
+            self.skipped += len(self._jobs.popleft()[0])
+
+
+def _small_index(prior: PriorMap) -> VoxelIndex:
+    """Index a map for what is looked up once: most points of a cloud never come again."""
+    index = VoxelIndex(prior.points, prior.normals, reach=REACH, cache_cells=CACHE_CELLS)
+    return index.reserve()
+
+
+def _joined(parts: list[np.ndarray], empty: tuple[int, ...] = (0,)) -> np.ndarray:
+    return np.concatenate([np.empty(empty), *parts])

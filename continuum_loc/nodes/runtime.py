@@ -7,11 +7,13 @@ from collections.abc import Callable
 import json
 import os
 from pathlib import Path
+import signal
 import sys
 import tempfile
+import threading
 from typing import Any
 
-from continuum_loc.nodes.parameters import declare, refuse_unknown
+from continuum_loc.nodes.parameters import declare, guard, live_fields, read, refuse_unknown
 from continuum_loc.settings import Settings, SettingsError
 from msg_tools.errors import BagError, ConvertError
 from msg_tools.factory import ros_messages
@@ -19,12 +21,14 @@ from msg_tools.topics import Topic
 import numpy as np
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError  # rclpy gives it no public name
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
 BAD_INPUT = 2
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class PackageNode(Node):
@@ -34,6 +38,7 @@ class PackageNode(Node):
         super().__init__(name, **options)
         self.finished = Future()
         self.settings = declare(self, defaults)
+        self._guarded = False
 
     def finish(self) -> None:
         """End the spin of this node (from any thread)."""
@@ -71,13 +76,32 @@ class PackageNode(Node):
             ros_messages().resolve(type_name), topic, take, qos, raw=raw
         )
 
+    def every(self, period: float, action: Callable[[], None]) -> None:
+        """Do `action` each `period` seconds of real time: a simulated clock may stand still."""
+        self.create_timer(period, action, clock=STEADY)
+
     def now(self) -> int:
         """Read the node's clock in integer nanoseconds (0 while simulated time has not begun)."""
         return self.get_clock().now().nanoseconds
 
     def check_parameters(self) -> None:
-        """Refuse parameters that this node does not have; call it when all are declared."""
+        """Refuse strange parameters, and changes that cannot be; call it when all are declared."""
         refuse_unknown(self)
+        if not self._guarded:
+            guard(self, self._change)
+            self._guarded = True
+
+    def live_parameters(self) -> set[str]:
+        """Return the names of the parameters that may change while the node runs."""
+        return live_fields(type(self.settings))
+
+    def _change(self, values: dict[str, Any]) -> str | None:
+        """Take changed parameters, or return the reason why not."""
+        fixed = sorted(set(values) - self.live_parameters())
+        if fixed:
+            return f"'{fixed[0]}' is fixed while the node runs: set it when you start it"
+        self.settings = read(self, type(self.settings), changed=values)
+        return None
 
 
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
@@ -103,6 +127,7 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         if rclpy.ok():
             return _complain(error)
     finally:
+        _ignore_signals()
         if node is not None:
             node.close()
             node.destroy_node()
@@ -117,6 +142,13 @@ def _spin(node: PackageNode) -> None:
         executor.spin_until_future_complete(node.finished)
     finally:
         executor.remove_node(node)
+
+
+def _ignore_signals() -> None:
+    """Let nothing interrupt the end: a terminal and a launch file may both send their SIGINT."""
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _complain(error: Exception) -> int:

@@ -197,6 +197,34 @@ class ReplayerNodeSettings(Settings):
     wait_timeout: float = Field(60.0, gt=0.0, description='give up waiting after this time [s]')
 
 
+class DriverNodeSettings(Settings):
+    """Node `driver`."""
+
+    robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
+    source: str = Field(
+        '-', description='serial port, pipe or file of JSON lines; - is the standard input'
+    )
+    frame_prefix: str = Field(
+        '', description='put before every frame name except `map` (several robots)'
+    )
+    delay: float = _live(
+        0.0, ge=0.0, description='age of a reading without a stamp of its own when it comes [s]'
+    )
+    gyro_mdps_per_lsb: float = Field(
+        17.5, gt=0.0, description="the gyro's sensitivity; 17.5 at +-500 dps [mdps/LSB]"
+    )
+    accel_mg_per_lsb: float = Field(
+        0.122, gt=0.0, description="the accelerometer's sensitivity; 0.122 at +-4 g [mg/LSB]"
+    )
+    core_azimuth_deg: tuple[float, ...] = Field(
+        (0.0, 120.0, 240.0),
+        description="where the fibre's outer cores lie, from body y to z [deg]",
+    )
+    core_radius: float = Field(
+        35e-6, gt=0.0, description="distance of the outer cores from the fibre's axis [m]"
+    )
+
+
 class ViewerNodeSettings(Settings):
     """Node `viewer`."""
 

@@ -15,7 +15,6 @@ import time
 from typing import Any
 
 from continuum_loc.nodes.pacing import Paced
-from continuum_loc.nodes.parameters import guard, live_fields, read
 from continuum_loc.nodes.runtime import Delays, output_qos, PackageNode, run, write_summary
 from continuum_loc.nodes.settings import SimulatorNodeSettings
 from continuum_loc.robot import load_robot
@@ -32,7 +31,6 @@ class SimulatorNode(PackageNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('simulator', SimulatorNodeSettings(), **options)
         self.check_parameters()
-        guard(self, self._change)
         self.robot = load_robot(self.settings.robot)
         self.world = self._world()
         self.published: Counter[str] = Counter()
@@ -44,7 +42,7 @@ class SimulatorNode(PackageNode):
         self._paced = Paced(self._stamped(), self.settings.lookahead)
         self._shift: int | None = None
         self._thread = threading.Thread(target=self._simulate, name='simulation', daemon=True)
-        self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
 
     def close(self) -> None:
@@ -150,14 +148,7 @@ class SimulatorNode(PackageNode):
         self.published[topic] += 1
         self.delays.add(delay)
 
-    # ------------------------------------------------ parameters, diagnostics
-
-    def _change(self, values: dict[str, Any]) -> str | None:
-        fixed = sorted(set(values) - live_fields(SimulatorNodeSettings))
-        if fixed:
-            return f"'{fixed[0]}' is fixed while the node runs: set it when you start it"
-        self.settings = read(self, SimulatorNodeSettings, changed=values)
-        return None
+    # ------------------------------------------------ diagnostics
 
     def _publish_diagnostics(self) -> None:
         recent = self.delays.recent(500)

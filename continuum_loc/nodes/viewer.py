@@ -11,6 +11,7 @@ import sys
 import threading
 from typing import Any
 
+from continuum_loc.mapping.anomalies import AnomalySettings
 from continuum_loc.nodes.runtime import input_qos, PackageNode, run
 from continuum_loc.nodes.settings import ViewerNodeSettings
 from continuum_loc.settings import SettingsError
@@ -29,6 +30,7 @@ SHOWN = {
     'reconstruction': 'reconstruction',
     'prior_map': 'map',
 }
+NEW = 'new'  # what the map does not show
 PAGE = Path(__file__).parent / 'viewer.html'
 NOTHING = {'x': [], 'y': [], 'z': []}
 
@@ -39,7 +41,7 @@ class ViewerNode(PackageNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('viewer', ViewerNodeSettings(), **options)
         self.check_parameters()
-        self.newest = dict.fromkeys(SHOWN.values(), NOTHING)
+        self.newest = dict.fromkeys((*SHOWN.values(), NEW), NOTHING)
         self.status: dict[str, tuple[int, str]] = {}
         self.map_version = 0
         self.server = self._serve()
@@ -77,6 +79,8 @@ class ViewerNode(PackageNode):
             }
             return
         self.newest[SHOWN[topic]] = self._columns(topic, item)
+        if topic == 'reconstruction':
+            self.newest[NEW] = self._columns(topic, _new_points(item))
         self.map_version += topic == 'prior_map'
 
     def _columns(self, topic: str, item: Any) -> dict[str, list[float]]:
@@ -116,6 +120,13 @@ class ViewerNode(PackageNode):
             ) from None
         threading.Thread(target=server.serve_forever, name='http', daemon=True).start()
         return server
+
+
+def _new_points(cloud: CloudRecord) -> CloudRecord:
+    """Those of the reconstructed points that lie off the map (eq. 12)."""
+    anomaly = cloud.fields.get('anomaly', np.zeros(len(cloud.points)))
+    chosen = anomaly**2 > AnomalySettings().tau
+    return CloudRecord(cloud.stamp, {name: v[chosen] for name, v in cloud.fields.items()})
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from continuum_loc.mapping.reconstruct import RingTrajectory
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -20,6 +21,7 @@ from continuum_loc.measurements import (
     TOF_VALID,
     TofFrame,
 )
+from continuum_loc.nodes.memory import SeenScene
 from continuum_loc.robot import RobotDescription
 import numpy as np
 
@@ -49,16 +51,18 @@ def rest_samples(
             yield from _frames(robot, stamp, rng)
 
 
-def warm_up(filter_: Any, robot: RobotDescription, window: float) -> None:
+def warm_up(filter_: Any, scene: SeenScene, robot: RobotDescription, window: float) -> None:
     """
-    Compile every kernel that `filter_` uses, then reset it.
+    Compile every kernel that `filter_` and `scene` use.
 
-    It runs past its first marginalisation for that.
-
-    The tube is not what the map shows, so that the search for a lost body runs, and compiles, too.
+    Runs the filter past its first marginalisation, places what would be seen then, and resets the
+    filter. The tube is not what the map shows, so that the search for a lost body compiles too.
     """
-    for sample in rest_samples(robot, 1.3 * window + 0.3):
-        filter_.process(sample)
+    made = [filter_.process(sample) for sample in rest_samples(robot, 1.3 * window + 0.3)]
+    estimate = next((one for one in reversed(made) if one is not None), None)
+    if estimate is not None and robot.tof:
+        frames = list(_frames(robot, estimate.stamp, np.random.default_rng(0)))
+        scene.placed(frames, RingTrajectory.of_estimates([estimate]))
     filter_.flush()
     filter_.reset()
 

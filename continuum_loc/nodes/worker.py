@@ -13,11 +13,11 @@ from queue import SimpleQueue
 import threading
 import time
 import traceback
-from typing import Any
+from typing import Any, TypeVar
 
 from continuum_loc.measurements import Measurement, NANOSECONDS
 from continuum_loc.nodes.intake import Inbox, Intake, Queued
-from continuum_loc.nodes.parameters import guard, live_fields, read
+from continuum_loc.nodes.parameters import live_fields
 from continuum_loc.nodes.runtime import Delays, input_qos, output_qos, PackageNode, write_summary
 from continuum_loc.nodes.settings import IntakeSettings
 from continuum_loc.robot import load_robot
@@ -26,6 +26,8 @@ from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
 from msg_tools.topics import topic_spec, TRACKER
 import numpy as np
+
+T = TypeVar('T')
 
 OK, WARN, ERROR, STALE = range(4)
 POLL = 0.1  # s; how often an idle worker looks whether it has to stop
@@ -69,6 +71,10 @@ class WorkerNode(PackageNode):
         """
         raise NotImplementedError
 
+    def idle(self) -> bool:
+        """Do a little of what can wait, as no message does; False where there is nothing to do."""
+        return False
+
     def restart(self) -> None:
         """Forget the past: the data starts again. Called in the worker."""
         raise NotImplementedError
@@ -92,7 +98,6 @@ class WorkerNode(PackageNode):
     def begin(self) -> None:
         """Subscribe and start to work: call it when everything is ready for data."""
         self.check_parameters()
-        guard(self, self._change)
         for topic in self._input_topics():
             spec = topic_spec(topic)
             self.listen(
@@ -101,7 +106,7 @@ class WorkerNode(PackageNode):
                 partial(self._receive, topic),
                 input_qos(spec, self.settings.intake.reliable_inputs),
             )
-        self.create_timer(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         self._thread.start()
         self.get_logger().info(f"ready: robot '{self.robot.name}'")
 
@@ -172,7 +177,8 @@ class WorkerNode(PackageNode):
     def _work(self) -> None:
         try:
             while not self._stop.is_set():
-                queued = self.inbox.take(POLL)
+                leisure = not len(self.inbox) and self._attempt(self.idle, 'what it had seen')
+                queued = self.inbox.take(0.0 if leisure else POLL)
                 while not self._tasks.empty():
                     self._tasks.get()()
                 if queued is not None:
@@ -185,7 +191,7 @@ class WorkerNode(PackageNode):
 
     def _handle(self, queued: Queued) -> None:
         restarts = self.intake.gate.restarts
-        measurement = self.intake.accept(queued.topic, queued.message, queued.arrival, self.now())
+        measurement = self.intake.accept(queued.topic, queued.message, queued.arrival)
         if self.intake.gate.restarts != restarts:
             self.get_logger().warning(
                 'time went backward: the data starts again, and so does the estimate'
@@ -194,19 +200,23 @@ class WorkerNode(PackageNode):
         if measurement is None:
             return
         begin = time.perf_counter()
+        stamp = self._attempt(lambda: self.consume(measurement), queued.topic)
+        if stamp is not None:
+            self._note(stamp, queued, time.perf_counter() - begin)
+
+    def _attempt(self, action: Callable[[], T], what: str) -> T | None:
+        """Do `action`; a failure on what it was given is counted, and the estimate starts anew."""
         try:
-            stamp = self.consume(measurement)
+            return action()
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
             self.failures += 1
             self.intake.refuse(
                 'failure',
-                f'the estimator failed on {queued.topic} ({type(error).__name__}: {error}) '
+                f'the estimator failed on {what} ({type(error).__name__}: {error}) '
                 'and starts anew',
             )
             self.restart()
-            return
-        if stamp is not None:
-            self._note(stamp, queued, time.perf_counter() - begin)
+            return None
 
     def _note(self, stamp: int, queued: Queued, seconds: float) -> None:
         self.step.add(seconds)
@@ -217,18 +227,17 @@ class WorkerNode(PackageNode):
 
     # ------------------------------------------------ parameters, diagnostics
 
+    def live_parameters(self) -> set[str]:
+        """Return those of the node and of its intake."""
+        intake = {f'intake.{name}' for name in live_fields(IntakeSettings)}
+        return super().live_parameters() | intake
+
     def _change(self, values: dict[str, Any]) -> str | None:
-        live = live_fields(type(self.settings)) | {
-            f'intake.{name}' for name in live_fields(IntakeSettings)
-        }
-        fixed = sorted(set(values) - live)
-        if fixed:
-            return f"'{fixed[0]}' is fixed while the node runs: set it when you start it"
-        self.settings = read(self, type(self.settings), changed=values)
+        reason = super()._change(values)
         self.inbox.settings = self.intake.settings = self.intake.gate.settings = (
             self.settings.intake
         )
-        return None
+        return reason
 
     def _report(self, kind: str, text: str) -> None:
         self.get_logger().warning(f"{text} [further cases of '{kind}' are only counted]")

@@ -13,6 +13,7 @@ from typing import Any
 
 from continuum_loc.nodes.parameters import constraint, leaves
 from continuum_loc.nodes.settings import (
+    DriverNodeSettings,
     EstimatorNodeSettings,
     RecorderNodeSettings,
     ReplayerNodeSettings,
@@ -30,6 +31,7 @@ NODES: dict[str, Settings] = {
     'shape': ShapeNodeSettings(),
     'recorder': RecorderNodeSettings(),
     'replayer': ReplayerNodeSettings(),
+    'driver': DriverNodeSettings(),
     'viewer': ViewerNodeSettings(),
 }
 FILTER_NOTE = """\

@@ -57,7 +57,7 @@ class TofFactor(Factor):
             for number, sensor in enumerate(robot.tof)
         }
         self._names = list(self._sensors)
-        self._index = index
+        self.index = index
         self._repeats = Repeats(MOST_REPEATS)
         if prior_map is not None:
             self._cloud, self._normals = (
@@ -74,11 +74,11 @@ class TofFactor(Factor):
     @property
     def map_arrays(self) -> tuple:
         """Return what the kernels need of the map: lookup, points, normals, weights, variance."""
-        return self._index.arrays, self._cloud, self._normals, self._planarity, self._map_variance
+        return self.index.arrays, self._cloud, self._normals, self._planarity, self._map_variance
 
     def row(self, measurement: TofFrame) -> tuple:
         number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, 'ToF')
-        if self._index is None:
+        if self.index is None:
             raise MeasurementError('no map', 'ToF frames need a prior map')
         model = self.robot.tof_model
         points = np.asarray(measurement.points, float)
