@@ -48,3 +48,16 @@ class Estimate:
     converged: bool = True
     step_seconds: float = 0.0
     lagged: Estimate | None = None
+
+    @property
+    def least_known(self) -> tuple[int, float, np.ndarray]:
+        """
+        Find the direction in which a position is known least.
+
+        Returns the index of the ring, the standard deviation there [m] and the unit vector (3,)
+        in the map. Large where no measurement observes it: along a smooth pipe, say.
+        """
+        R = self.T_map_ring[:, :3, :3]
+        variances, axes = np.linalg.eigh(R @ self.covariance[:, :3, :3] @ R.swapaxes(1, 2))
+        ring = int(np.argmax(variances[:, 2]))
+        return ring, float(np.sqrt(max(variances[ring, 2], 0.0))), axes[ring, :, 2]

@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
 FILTER = 'filter.'
+POORLY_KNOWN = 0.05  # [m] a ring farther from known in some direction is told
 
 
 class EstimatorNode(WorkerNode):
@@ -89,19 +90,23 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def describe(self) -> tuple[int, str, dict[str, Any]]:
-        """Lost is an error; starting, unconverged steps and suspects are warnings."""
+        """Lost is an error; starting, suspects, what is not observed and so on are warnings."""
         estimate = self.estimate
         if estimate is None:
             return WARN, 'no estimate yet', {}
         inliers = (
             float(np.mean(list(estimate.inliers.values()))) if estimate.inliers else float('nan')
         )
+        suspects = ', '.join(f'{name} ({why})' for name, why in estimate.suspects.items())
+        number, sigma, axis = estimate.least_known
+        ring = ('base', *self.robot.ring_names)[number]
         recent = self.step.recent(30)
         values = {
             'status': estimate.status,
             'consistency': estimate.consistency,
             'inliers': inliers,
-            'suspects': ', '.join(estimate.suspects) or 'none',
+            'suspects': suspects or 'none',
+            'least known': f'{ring} to {1e3 * sigma:.1f} mm along {np.round(axis, 2).tolist()}',
             'iterations': estimate.iterations,
             'step mean [ms]': float(1e3 * recent.mean()) if len(recent) else float('nan'),
             'latency [ms]': float(1e3 * np.median(self.latency.recent(30)))
@@ -114,7 +119,9 @@ class EstimatorNode(WorkerNode):
         if estimate.status == 'initialising':
             return WARN, 'initialising', values
         if estimate.suspects:
-            return WARN, f'suspect: {", ".join(estimate.suspects)}', values
+            return WARN, f'suspect: {suspects}', values
+        if sigma > POORLY_KNOWN:
+            return WARN, f'nothing observes {values["least known"]}', values
         return (
             (OK, 'tracking', values)
             if estimate.converged
