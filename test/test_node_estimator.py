@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed')
 
-from continuum_loc.mapping.prior_map import load_map
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import nanoseconds, TofFrame
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import tracker_message

@@ -9,7 +9,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed')
 
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.mapping.anomalies import AnomalySettings
-from continuum_loc.mapping.prior_map import load_map
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.nodes.memory import SeenScene
 from node_graph import BOX, BoxRobot
 
