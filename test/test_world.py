@@ -506,6 +506,20 @@ def test_contacts_hold_the_body_out_of_the_scene(robot):
         assert max(inside) > -0.002  # the trajectory does lean on the blades
 
 
+@pytest.mark.parametrize(
+    ('scene', 'path', 'until'), [('R1', 'b6', 8.5), ('R2', 'b7', 6.5), ('R3', 'b8', 8.1)]
+)
+def test_the_soft_arm_touches_what_stands_in_the_box(scene, path, until):
+    from continuum_loc.simulator.scenes import load_scene
+
+    arm = load_robot('soft_arm').model_copy(update={'tof': (), 'imu': ()})
+    world = World(arm, load_scene(scene), path)
+    depth = [world.body.penetration() for _ in world.run(until)]
+    assert 0.0 < max(depth) < 0.01  # a tap at a metre a second, held by a rigid object
+    empty = World(arm, load_scene('R0'), path)
+    assert not any(empty.body.penetration() for _ in empty.run(until))
+
+
 # --------------------------------------------------------------------------- bad input
 
 

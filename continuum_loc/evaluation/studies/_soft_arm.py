@@ -9,12 +9,12 @@ from __future__ import annotations
 from continuum_loc.evaluation.trials import Trial
 
 # 23 trajectories over five scenes, at least four in each; with the 13 pairs below that makes 61
-# combinations.
+# combinations. The last one in R1, R2 and R3 swings the arm against what stands there.
 TRAJECTORIES = {
     'R0': ('b1', 'b2', 'b3', 'b4'),
-    'R1': ('b1', 'b2', 'b3', 'b4', 'b5'),
-    'R2': ('b1', 'b2', 'b3', 'b4', 'b5'),
-    'R3': ('b1', 'b2', 'b3', 'b4', 'b5'),
+    'R1': ('b1', 'b2', 'b3', 'b4', 'b6'),
+    'R2': ('b1', 'b2', 'b3', 'b4', 'b7'),
+    'R3': ('b1', 'b2', 'b3', 'b4', 'b8'),
     'R4': ('b1', 'b2', 'b3', 'b4'),
 }
 MATCHING = tuple((f'R{k}', f'R{k}') for k in range(5))
