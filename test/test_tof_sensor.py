@@ -449,3 +449,21 @@ def _in_the_box(yaw: float = 0.0) -> np.ndarray:
     T_map_sensor[:3, :3] = Rotation.from_euler('z', yaw).as_matrix()
     T_map_sensor[:3, 3] = [-0.1, 0.0, 0.3]
     return T_map_sensor
+
+
+def test_the_noise_tests_of_the_study_pass_and_notice_a_wrong_model(monkeypatch):
+    from continuum_loc.evaluation.studies import _vl53l5cx
+
+    rows = {row['sensor']: row['p_value'] for row in _vl53l5cx.noise(0)}
+    assert len(rows) == 6 and min(rows.values()) > 1e-3
+    assert _vl53l5cx.mechanisms(0)['wide'] == 1.0
+    # The sensor made a little noisier, deaf to its neighbours, and three times as forgetful; what
+    # the tests expect is still the usual sensor.
+    usual = _vl53l5cx.Vl53l5cxReceiver
+    changed = Vl53l5cxSettings(noise_floor=0.004, crosstalk=0.0, dropout=0.006)
+    monkeypatch.setattr(_vl53l5cx, 'Vl53l5cxReceiver', lambda model, *_: usual(model, changed))
+    rows = {row['sensor']: row['p_value'] for row in _vl53l5cx.noise(0)}
+    assert rows['VL53L5CX depth, wall at 1 m'] < 1e-3
+    assert rows['VL53L5CX depth, edge of 8 cm'] < 1e-3
+    assert rows['VL53L5CX dropouts'] < 1e-3
+    assert rows['VL53L5CX drowned by crosstalk (12)'] < 1e-3

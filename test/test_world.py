@@ -6,6 +6,11 @@ Every sensor agrees with the truth, and seeds decide everything.
 
 from collections import Counter, defaultdict
 import dataclasses
+import hashlib
+import os
+from pathlib import Path
+import subprocess
+import sys
 
 from continuum_loc import lie
 from continuum_loc.measurements import (
@@ -291,6 +296,39 @@ def test_the_same_seed_gives_the_same_samples_to_the_bit(scene):
         assert len(other) == len(runs[0]) and all(
             same(a, b) for a, b in zip(runs[0], other, strict=True)
         )
+
+
+def test_another_process_makes_the_same_samples_to_the_bit():
+    """A process of its own, with other hash seeds and another number of threads."""
+    code = (
+        'import sys; sys.path.insert(0, sys.argv[1]); import test_world; '
+        'print(test_world.digest_of_a_run())'
+    )
+    digests = {
+        subprocess.run(
+            [sys.executable, '-c', code, str(Path(__file__).parent)],
+            env=os.environ | {'PYTHONHASHSEED': seed, 'OMP_NUM_THREADS': threads},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for seed, threads in (('1', '1'), ('2', '4'))
+    }
+    assert digests == {f'{digest_of_a_run()}\n'}
+
+
+def digest_of_a_run() -> str:
+    """SHA-256 of every array and number of a short run with all sensors of the box scene."""
+    from continuum_loc.simulator.scenes import load_scene
+
+    digest = hashlib.sha256()
+    arm = load_robot('soft_arm')
+    for sample in World(arm, load_scene('R4'), 'b2', tof_fidelity='vl53l5cx', seed=5).run(0.3):
+        for value in arrays(sample):
+            digest.update(
+                value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            )
+    return digest.hexdigest()
 
 
 def test_another_seed_changes_every_noisy_sample_and_no_truth(scene):

@@ -15,6 +15,7 @@ import time
 from typing import Any
 
 from continuum_loc import lie
+from continuum_loc.evaluation.studies import _vl53l5cx
 from continuum_loc.evaluation.study import at_least, at_most, between, Claim, write_study
 from continuum_loc.measurements import (
     EncoderSample,
@@ -54,7 +55,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     statics = [*_statics((12, 24, 50) if quick else (6, 12, 24, 50, 100, 150))]
     shapes = [*_shapes(3 if quick else 20, seed)]
     vibration = [first_mode(24, step) for step in (0.002, 0.005)]
-    noise = [*_noise(seed)]
+    noise = [*_noise(seed), *_vl53l5cx.noise(seed)]
     motion = [
         _consistency('t2', 5.0 if quick else 20.0),
         *_contact(
@@ -71,6 +72,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
             at_least(f'p-value of the {row["sensor"]} noise', row['p_value'], '', FALSE_ALARM)
             for row in noise
         ),
+        *_mechanism_claims(_vl53l5cx.mechanisms(seed)),
         *_motion_claims(motion),
         at_least(
             'real-time factor, live engine, contacts, 16 ToF in vl53l5cx, one core', speed, '', 1.5
@@ -355,6 +357,22 @@ def _tof_errors(robot: RobotDescription, seed: int) -> np.ndarray:
     )
     seen = np.isfinite(noisy) & np.isfinite(true)
     return (noisy[seen] - true[seen]) / robot.tof_model.sigma(true[seen])
+
+
+def _mechanism_claims(found: dict[str, float]) -> Iterator[Claim]:
+    yield at_most('VL53L5CX depth: departure from whole millimetres', found['rounding'], 'm', 1e-9)
+    yield at_least(
+        'VL53L5CX status 9: share of zones flagged as their spread of depth says',
+        found['wide'],
+        '',
+        1.0,
+    )
+    yield at_most(
+        'VL53L5CX status 12 away from bright neighbours: share of zones',
+        found['falsely drowned'],
+        '',
+        0.0,
+    )
 
 
 # -------------------------------------------------------------------------- motion, contact, speed
