@@ -59,8 +59,8 @@ def _by_cuts(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
         tiles = cutting.tiles(vertices, faces)
     except ValueError as error:
         raise SceneError(
-            f'{where}: cannot be cut into convex pieces for contact ({error}); mend the mesh '
-            'where its surface meets itself'
+            f'{where}: cannot be cut into convex pieces ({error}); mend the mesh where '
+            'its surface meets itself'
         ) from None
     bar = track(tiles, 'contact pieces', console=Console(stderr=True), transient=True)
     return tuple(piece for tile in bar for piece in cutting.pieces(*tile, allowed))

@@ -47,7 +47,7 @@ def pieces(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Iterato
         low, high = _box(solid)
         gap, normal, centre = _gaps(solid, hull, _SHALLOW * tolerance)
         halves = []
-        if gap.max(initial=0.0) > tolerance:
+        if gap.max(initial=0.0) > tolerance and (high - low).max() > 2.0 * tolerance:
             # The longest edge first: it wins where halving saves nothing either way.
             planes = [(np.eye(3)[k], (low + high)[k] / 2.0, 0.0) for k in np.argsort(low - high)]
             hidden = np.flatnonzero(gap > tolerance)
@@ -56,7 +56,7 @@ def pieces(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Iterato
                 (normal[face], normal[face] @ centre[face] + _FOIL, _FACE_PREFERENCE)
                 for face in _different(normal, hidden[np.argsort(-gap[hidden])])
             ]
-            halves = _best_cut(solid, hull, planes, tolerance)
+            halves = _best_cut(solid, hull, planes)
         if halves:
             waiting += [part for half in halves for part in _parts(half)]
         else:
@@ -67,20 +67,15 @@ def _best_cut(
     solid: Manifold,
     hull: Manifold,
     planes: list[tuple[np.ndarray, float, float]],
-    thinnest: float,
 ) -> list[Manifold]:
     """
     Halve a solid so that most of its hull's excess is saved; no halves where no cut works.
 
     planes: unit normal, offset [m], share of the excess that it has to save beyond the others.
-    thinnest: what each half must measure across the cut [m]; slices that thin would pass for flat.
     """
-    excess, corners = hull.volume() - solid.volume(), vertices_of(hull)
+    excess = hull.volume() - solid.volume()
     best, chosen = np.inf, []
     for direction, offset, handicap in planes:
-        heights = corners @ direction - offset
-        if min(-heights.min(), heights.max()) < thinnest:
-            continue
         halves = _cut(solid, direction, offset)
         if min(half.volume() for half in halves) < _SLIVER * solid.volume():
             continue
@@ -124,20 +119,19 @@ def _gaps(
     solid: Manifold, hull: Manifold, shallow: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each face of a solid: free way to its hull along the normal (F,) [m]; normal, centre."""
-    normal, centre = _planes(solid, _NO_AREA)
-    # Slivers between nearly coplanar points have normals of chance.
-    outward, support = _planes(hull, 1e-5 * hull.surface_area())
+    normal, centre = _planes(solid)
+    outward, support = _planes(hull)
     offset = np.einsum('ij,ij->i', outward, support)
     return _exits(normal, centre, outward, offset, shallow), normal, centre
 
 
-def _planes(solid: Manifold, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compute unit normals and centres (F, 3) of a solid's faces of at least `least` m^2."""
+def _planes(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
+    """Compute unit normals and centres (F, 3) of a solid's faces, but for slivers."""
     vertices, faces = mesh_of(solid)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     twice_area = np.linalg.norm(normal, axis=1)
-    sound = twice_area > 2.0 * least
+    sound = twice_area > _NO_AREA
     return normal[sound] / twice_area[sound, None], ((a + b + c) / 3.0)[sound]
 
 
