@@ -231,52 +231,6 @@ def _ask(query: Query, batches: list[np.ndarray]) -> float:
     return (time.process_time() - started) / sum(map(len, batches))
 
 
-def _compare(
-    name: str, ours: Query, peer: str, query: Query, batches: list[np.ndarray], repeats: int
-) -> dict:
-    """Alternate ours and the peer's; the ratio's median and quartiles over the repeats."""
-    query(batches[0])
-    return _row(name, peer, [(_ask(ours, batches), _ask(query, batches)) for _ in range(repeats)])
-
-
-def _row(name: str, peer: str, pairs: list[tuple[float, float]]) -> dict:
-    times = np.array(pairs)
-    ratio = times[:, 1] / times[:, 0]
-    low, high = np.quantile(ratio, [0.25, 0.75])
-    return {
-        'name': name,
-        'ours_s': float(np.median(times[:, 0])),
-        'peer': peer,
-        'peer_s': float(np.median(times[:, 1])),
-        'ratio': float(np.median(ratio)),
-        'spread': [float(low), float(high)],
-    }
-
-
-def _compare_first_visit(index, peer, query, batches, repeats) -> dict:
-    """Every repeat begins with an empty cache, as a filter does that has just been started."""
-    pairs = []
-    for _ in range(repeats):
-        fresh = index.copy()
-        pairs.append(
-            (
-                _ask(lambda q, fresh=fresh: fresh.nearest(q, MAX_DISTANCE), batches),
-                _ask(query, batches),
-            )
-        )
-    return _row('lookup, first visit', peer, pairs)
-
-
-def _compare_facing(prior, index, peer, query, batches, repeats) -> dict:
-    """Ours also demands that the surface faces the beam, which no peer can be asked for."""
-    rng = np.random.default_rng(2)
-    rows, _ = index.nearest(_filter_zones(prior)[0], MAX_DISTANCE)
-    beams = _unit(-prior.normals[rows] + 0.3 * rng.normal(size=(len(rows), 3)))
-    ours: Query = lambda q: index.nearest_facing(q, beams, MAX_DISTANCE, 0.1)  # noqa: E731
-    _ask(ours, batches)
-    return _compare('lookup, facing the beam', ours, peer, query, batches, repeats)
-
-
 if __name__ == '__main__':
     for row in run():
         print(

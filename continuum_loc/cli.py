@@ -440,6 +440,8 @@ def bench(
     from continuum_loc.evaluation.runs import new_run
 
     names = benches.bench_names()
+    if check:
+        benches.read_baseline()  # before the work, not after it
     if peers:
         benches.install_peers()
     outcome = benches.run_bench(out or new_run('bench'), quick, only, _each)

@@ -6,9 +6,12 @@ A baseline of ratios is committed.
 A benchmark NAME is a file `bench/NAME.py` of the source tree with `run(quick: bool) ->
 list[dict]`. Each row has `name`, `ours_s`, `peer`, `peer_s`, `ratio` (peer over ours, the median
 over interleaved repeats) and `spread` (the ratio's quartiles); a row without a peer has None in
-the last four. An optional `BOUNDS` of the module, a list of (text in the row's name, field, "at
-least" or "at most", limit), says what the rows are meant to show, each judged on the worst row
-whose name holds the text.
+the last four. `side_by_side` and `alone` make such rows. An optional `BOUNDS` of the module, a
+list of (text in the row's name, field, "at least" or "at most", limit), says what the rows are
+meant to show, each judged on the worst row whose name holds the text.
+
+Times are processor time of this process, on one core (`one_core`): what one would wait for on a
+quiet machine, whoever else uses this one.
 """
 
 from __future__ import annotations
@@ -22,16 +25,18 @@ import os
 from pathlib import Path
 import subprocess
 import sys
+from time import process_time
 import traceback
 from types import ModuleType
 from typing import Any
 
 from continuum_loc.evaluation.study import at_least, at_most, Claim, write_study
+import numpy as np
 
 BENCH_FOLDER = Path(__file__).parents[2] / 'bench'
 BASELINE = BENCH_FOLDER / 'baseline.json'
-# A ratio's fall counts beyond this share, or out of both runs' quartiles, whichever is more.
-SLACK = 0.25
+SHORTEST = 5e-3  # [s] that an action is timed for, by as many calls as that takes
+SLACK = 0.25  # a ratio may fall by this share, or out of both runs' quartiles, whichever is more, before it counts
 
 
 @contextmanager
@@ -43,6 +48,63 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, cores)
+
+
+def side_by_side(
+    name: str,
+    ours: Callable[[], object],
+    peer: str,
+    theirs: Callable[[], object],
+    repeats: int,
+    per_call: int = 1,
+    **more: Any,
+) -> dict[str, Any]:
+    """
+    Row of two actions timed in turn, after one call each that is not counted.
+
+    Every repeat takes the two in the other order, and each long enough for the clock.
+    per_call: units of work in a call (the row states seconds per unit); more: further fields.
+    """
+    actions = (ours, theirs)
+    calls = [_calls_worth_timing(action) for action in actions]
+    times = np.empty((repeats, 2))
+    for k in range(repeats):
+        for which in (0, 1) if k % 2 == 0 else (1, 0):
+            times[k, which] = seconds_of(actions[which], calls[which]) / per_call
+    return paired(name, peer, times, **more)
+
+
+def paired(name: str, peer: str, times: np.ndarray, **more: Any) -> dict[str, Any]:
+    """Row of interleaved times (repeats, 2) [s], ours and the peer's; more: further fields."""
+    ratio = times[:, 1] / times[:, 0]
+    return {
+        'name': name,
+        'ours_s': float(np.median(times[:, 0])),
+        'peer': peer,
+        'peer_s': float(np.median(times[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'spread': [float(quartile) for quartile in np.quantile(ratio, [0.25, 0.75])],
+        **more,
+    }
+
+
+def alone(name: str, seconds: float, **more: Any) -> dict[str, Any]:
+    """Row of something that has no peer; more: further fields."""
+    nobody = dict.fromkeys(('peer', 'peer_s', 'ratio', 'spread'))
+    return {'name': name, 'ours_s': float(seconds), **nobody, **more}
+
+
+def seconds_of(action: Callable[[], object], calls: int = 1) -> float:
+    """Processor time of a call [s], the mean over so many."""
+    started = process_time()
+    for _ in range(calls):
+        action()
+    return (process_time() - started) / calls
+
+
+def _calls_worth_timing(action: Callable[[], object]) -> int:
+    action()  # may compile, allocate, or fill a cache
+    return max(1, int(np.ceil(SHORTEST / max(seconds_of(action), 1e-9))))
 
 
 class BenchError(ValueError):
@@ -58,13 +120,8 @@ class BenchOutcome:
     failures: list[str]
 
     def regressions(self, baseline: Path = BASELINE) -> list[str]:
-        """List a line for each ratio that fell clearly below the committed one."""
-        if not baseline.is_file():
-            raise BenchError(
-                f'{baseline}: no baseline to compare with; '
-                'write one by `continuum-loc bench --baseline`'
-            )
-        known = {(row['name'], row['peer']): row for row in json.loads(baseline.read_text())}
+        """A line for each ratio that fell clearly below the committed one."""
+        known = read_baseline(baseline)
         return [
             f'{row["name"]} against {row["peer"]}: ratio {row["ratio"]:.2f}, '
             f'baseline {old["ratio"]:.2f}'
@@ -96,10 +153,10 @@ def bench_names() -> list[str]:
 def install_peers() -> None:
     """Install the libraries that we are compared with, which nothing else needs."""
     wanted = BENCH_FOLDER / 'requirements.txt'
+    pinned = BENCH_FOLDER.parent / 'requirements.txt'  # stays as it is, whatever a peer would like
     if wanted.is_file():
-        subprocess.run(
-            [sys.executable, '-m', 'pip', 'install', '--quiet', '-r', str(wanted)], check=True
-        )
+        files = ['-r', str(wanted), *(['-c', str(pinned)] if pinned.is_file() else [])]
+        subprocess.run([sys.executable, '-m', 'pip', 'install', '--quiet', *files], check=True)
 
 
 def run_bench(
@@ -185,6 +242,15 @@ def duration(seconds: float | None) -> str:
         if seconds < limit:
             return f'{seconds * factor:.3g} {unit}'
     return f'{seconds:.3g} s'
+
+
+def read_baseline(path: Path = BASELINE) -> dict[tuple[str, str], dict[str, Any]]:
+    """Rows of a baseline by (name, peer). Raises BenchError where there is none."""
+    if not path.is_file():
+        raise BenchError(
+            f'{path}: no baseline to compare with; write one by `continuum-loc bench --baseline`'
+        )
+    return {(row['name'], row['peer']): row for row in json.loads(path.read_text())}
 
 
 def write_baseline(rows: list[dict[str, Any]], path: Path = BASELINE) -> None:
