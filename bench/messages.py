@@ -103,7 +103,9 @@ def _map_rows(repeats: int) -> list[dict]:
         points = peer.read_points(message)
         return {name: points[name].copy() for name in points.dtype.names}
 
-    if bytes(written().data) != bytes(message.data) or not np.array_equal(read()['z'], single[:, 2]):
+    if bytes(written().data) != bytes(message.data) or not np.array_equal(
+        read()['z'], single[:, 2]
+    ):
         raise RuntimeError('the peer writes or reads another map: the comparison would be void')
     return [
         side_by_side(

@@ -44,10 +44,14 @@ def run(quick: bool = False) -> list[dict]:
         ):
             ours = _ours(caster, *fan)
             rows.append(
-                side_by_side(name, ours, 'Open3D RaycastingScene', _open3d(scene, *fan), 5 * repeats)
+                side_by_side(
+                    name, ours, 'Open3D RaycastingScene', _open3d(scene, *fan), 5 * repeats
+                )
             )
             rows.append(
-                side_by_side(name, ours, 'mj_multiRay', _multi_ray(model, data, *fan), slow_repeats)
+                side_by_side(
+                    name, ours, 'mj_multiRay', _multi_ray(model, data, *fan), slow_repeats
+                )
             )
         ours = _ours(caster, *frame)
         rows.append(

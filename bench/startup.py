@@ -52,7 +52,9 @@ def run(quick: bool = False) -> list[dict]:
         with one_core():
             return [
                 _row('startup, import continuum_loc', ['-c', 'import continuum_loc'], quick),
-                _row('startup, continuum-loc --help', ['-m', 'continuum_loc.cli', '--help'], quick),
+                _row(
+                    'startup, continuum-loc --help', ['-m', 'continuum_loc.cli', '--help'], quick
+                ),
                 _row('startup, first estimate', ['-c', _ESTIMATE.format(bag=str(bag))], quick),
                 _row('startup, node ready', node, quick),
             ]

@@ -153,9 +153,7 @@ class _Gtsam:
     def solve(self) -> np.ndarray:
         """All offsets, end to end."""
         values = self.optimise()
-        return np.concatenate(
-            [values.at(key) for key in range(self._columns * self._per_column)]
-        )
+        return np.concatenate([values.at(key) for key in range(self._columns * self._per_column)])
 
     def solve_and_covariance(self) -> tuple[object, np.ndarray]:
         """The solution, and the newest column's covariance (where a column is one variable)."""
@@ -174,7 +172,9 @@ class _Gtsam:
 def _require_close(theirs: np.ndarray, ours: np.ndarray, what: str) -> None:
     off = np.abs(theirs - ours).max() / np.abs(ours).max()
     if not off < AGREEMENT:
-        raise RuntimeError(f'gtsam and we disagree on the {what} by {off:.1e} of its largest entry')
+        raise RuntimeError(
+            f'gtsam and we disagree on the {what} by {off:.1e} of its largest entry'
+        )
 
 
 # ------------------------------------------------------------ the temporal chain, not linear

@@ -451,7 +451,7 @@ def bench(
     for line in outcome.failures:
         errors.print(f'[bold red]failed:[/] {escape(line)}', highlight=False)
     if baseline:
-        benches.write_baseline(outcome.rows)
+        benches.write_baseline(outcome.rows, partial=only is not None)
     regressions = outcome.regressions() if check else []
     for line in regressions:
         errors.print(f'[bold red]slower than the baseline:[/] {escape(line)}', highlight=False)

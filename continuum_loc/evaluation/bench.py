@@ -6,7 +6,8 @@ A baseline of ratios is committed.
 A benchmark NAME is a file `bench/NAME.py` of the source tree with `run(quick: bool) ->
 list[dict]`. Each row has `name`, `ours_s`, `peer`, `peer_s`, `ratio` (peer over ours, the median
 over interleaved repeats) and `spread` (the ratio's quartiles); a row without a peer has None in
-the last four. `side_by_side` and `alone` make such rows. An optional `BOUNDS` of the module, a
+the last four. `side_by_side` and `alone` make such rows; `exponent` and `memory_bytes` are shown where
+a row has them. An optional `BOUNDS` of the module, a
 list of (text in the row's name, field, "at least" or "at most", limit), says what the rows are
 meant to show, each judged on the worst row whose name holds the text.
 
@@ -229,6 +230,10 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
             'quartiles': '-'
             if row.get('ratio') is None
             else '{:.3g} to {:.3g}'.format(*row['spread']),
+            'exponent': '-' if row.get('exponent') is None else f'{row["exponent"]:.2f}',
+            'memory': '-'
+            if row.get('memory_bytes') is None
+            else f'{row["memory_bytes"] / 1e6:.0f} MB',
         }
         for row in rows
     ]
@@ -253,11 +258,17 @@ def read_baseline(path: Path = BASELINE) -> dict[tuple[str, str], dict[str, Any]
     return {(row['name'], row['peer']): row for row in json.loads(path.read_text())}
 
 
-def write_baseline(rows: list[dict[str, Any]], path: Path = BASELINE) -> None:
-    """Make these ratios the ones that later runs are compared with."""
-    kept = [
-        {key: row[key] for key in ('name', 'peer', 'ratio', 'spread')}
-        for row in rows
-        if row.get('ratio') is not None
-    ]
-    path.write_text(json.dumps(kept, indent=1) + '\n')
+def write_baseline(
+    rows: list[dict[str, Any]], path: Path = BASELINE, partial: bool = False
+) -> None:
+    """Make these ratios the ones that later runs are compared with; `partial` keeps the others."""
+    kept = read_baseline(path) if partial and path.is_file() else {}
+    for row in rows:
+        if row.get('ratio') is not None:
+            short = {key: row[key] for key in ('name', 'peer')}
+            kept[row['name'], row['peer']] = {
+                **short,
+                'ratio': float(f'{row["ratio"]:.4g}'),
+                'spread': [float(f'{quartile:.4g}') for quartile in row['spread']],
+            }
+    path.write_text(json.dumps(list(kept.values()), indent=1) + '\n')
