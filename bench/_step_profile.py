@@ -1,8 +1,9 @@
 """
-Draw where the time of a filter step goes: `python bench/_step_profile.py [PICTURE]` (make profile).
+Draw where the time of a filter step goes (make profile).
 
 The engine robot's filter at full sensor rate under cProfile, which sees compiled kernels and
-LAPACK as one function each: time of their own, gathered into parts, in milliseconds per step.
+LAPACK as one function each: time of their own, gathered into parts, in milliseconds per step. An
+argument names another picture file.
 """
 
 from __future__ import annotations

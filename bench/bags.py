@@ -19,7 +19,8 @@ import tempfile
 from typing import Any
 
 from continuum_loc.evaluation.bench import one_core, paired, seconds_of
-from continuum_loc.evaluation.trials import simulate, TOPICS as TOPIC_OF, Trial
+from continuum_loc.evaluation.trials import simulate, Trial
+from continuum_loc.evaluation.trials import TOPICS as TOPIC_OF
 from msg_tools.bag import BagWriter, read_bag
 from msg_tools.factory import bag_messages, typestore
 from msg_tools.topics import topic_spec
@@ -29,7 +30,7 @@ PEER = 'mcap-ros2-support'
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s, peer, peer_s (per second of data), ratio (peer / ours) and spread (its quartiles)."""
+    """Rows of name, ours_s, peer, peer_s (per second of data), ratio and spread."""
     duration, repeats = (4.0, 3) if quick else (20.0, 7)
     samples = list(simulate(Trial('engine', 'S0', 't2', duration=duration)))
     messages = list(_messages(samples))
@@ -54,7 +55,7 @@ def _messages(samples: list) -> Iterator[tuple[str, str, int, Any]]:
 
 
 def _plain(value: Any) -> Any:
-    """What mcap-ros2-support takes: mappings for messages, bytes and lists for arrays."""
+    """Turn a message into what mcap-ros2-support takes: mappings, bytes and lists."""
     if isinstance(value, np.ndarray):
         return value.tobytes() if value.dtype == np.uint8 else value.tolist()
     if isinstance(value, list):

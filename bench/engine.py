@@ -40,13 +40,13 @@ def run(quick: bool = False) -> list[dict]:
 
 
 def recording(duration: float) -> list[Measurement]:
-    """What the engine robot's sensors measure along t2."""
+    """Simulate what the engine robot's sensors measure along t2."""
     samples = simulate(Trial('engine', 'S0', 't2', duration=duration))
     return [sample for sample in samples if not isinstance(sample, TruthSample)]
 
 
 def _replayed(samples: list[Measurement]) -> tuple[np.ndarray, np.ndarray]:
-    """Time (2,) in the filter over all samples and (N, 2) of each step, [s] of the processor and on the wall."""
+    """Time (2,) of all samples and (N, 2) of each step [s], of the processor and on the wall."""
     estimator = make_filter(
         load_robot('engine'), scene_map('S0'), load_estimator_settings('engine')
     )

@@ -242,9 +242,10 @@ def _compare_first_visit(index, peer, query, batches, repeats) -> dict:
 
 def _compare_facing(prior, index, peer, query, batches, repeats) -> list[dict]:
     """
-    Ours also demands that the surface faces the beam, which no peer can be asked for: once beside
-    the nearest point of all, which is less work, and once beside what a user would do: ask for
-    NEIGHBOURS at once and take the first that faces, where there is one.
+    Compare the nearest surface that faces the beam, which no peer can be asked for.
+
+    Once beside the nearest point of all, which is less work, and once beside what a user would do:
+    ask for NEIGHBOURS at once and take the first that faces, where there is one.
     """
     rng = np.random.default_rng(2)
     rows, _ = index.nearest(_filter_zones(prior)[0], MAX_DISTANCE)
@@ -268,7 +269,7 @@ def _compare_facing(prior, index, peer, query, batches, repeats) -> list[dict]:
 
 
 def _compare_any(prior: PriorMap, beams: np.ndarray, ours: Query, batches: list[np.ndarray]):
-    """SciPy's tree asked for several neighbours, and the share of ours' answers that it finds so."""
+    """SciPy's tree asked for several neighbours, and the share of our answers that it finds."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(prior.points)

@@ -34,7 +34,7 @@ PEER = 'sensor_msgs_py'
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s, peer, peer_s (seconds per message), ratio (peer / ours) and spread (its quartiles)."""
+    """Rows of name, ours_s, peer, peer_s (per message), ratio and spread."""
     repeats = 5 if quick else 25
     with one_core():
         return [*_frame_rows(repeats), *_map_rows(max(repeats // 3, 3))]

@@ -41,7 +41,7 @@ MAPS = (50_000, 500_000, 5_000_000)
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s (seconds per step, per run or per lookup), size, exponent and memory_bytes."""
+    """Rows of name, ours_s (per step, run or lookup), size, exponent and memory_bytes."""
     duration = 2.5 if quick else 8.0
     samples = [
         sample
@@ -78,7 +78,7 @@ def _filter_groups(
 
 
 def _hearing(samples: list[Measurement], names: list[str]) -> list[Measurement]:
-    """The samples without those of other ToF sensors."""
+    """Leave out what other ToF sensors measured."""
     return [one for one in samples if not isinstance(one, TofFrame) or one.sensor in names]
 
 
@@ -88,7 +88,7 @@ def _step(
     settings: EstimatorSettings,
     settled: float = SETTLED,
 ) -> tuple[SlidingWindowFilter, float]:
-    """The filter after all samples, and its processor time per step once it has settled."""
+    """Run a filter; it, and its processor time per step once it has settled."""
     filter_ = SlidingWindowFilter(load_robot('engine'), prior, settings)
     begin, steps, started = samples[0].stamp + round(settled * NANOSECONDS), 0, None
     for sample in samples:
@@ -101,7 +101,7 @@ def _step(
 def _durations(
     samples: list[Measurement], prior: PriorMap, settings: EstimatorSettings, duration: float
 ) -> list[dict]:
-    """Processor time of the filter from its start to a quarter, a half and all of the data; resident size there."""
+    """Time a run up to a quarter, a half and all of the data; its resident size there."""
     filter_, started, spent, memory = (
         SlidingWindowFilter(load_robot('engine'), prior, settings),
         time.process_time(),
@@ -121,7 +121,7 @@ def _durations(
 
 
 def _maps(samples: list[Measurement], settings: EstimatorSettings, quick: bool) -> list[dict]:
-    """The filter's step and a lookup of 1000 places near the surface, looked up before."""
+    """Time a step, and a lookup of 1000 places near the surface that was made before."""
     steps, lookups, memory = [], [], []
     for points in MAPS[:2] if quick else MAPS:
         prior = _random_map(points)

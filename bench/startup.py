@@ -1,10 +1,12 @@
 """
-What one waits for before anything happens: import, help, the first estimate, a node. Fresh
-processes, on one core.
+What one waits for before anything happens: import, help, the first estimate, a node.
+
+Fresh processes, on one core.
 
 Kernels are compiled on the first run on a machine and kept; these rows have them kept. `ours_s` is
 the processor time of the process, `wall_s` what the clock on the wall said meanwhile (more, where
-the machine is shared), `memory_bytes` the greatest resident size by then. The node is the estimator with the engine robot and its map, from its start until its log says `ready`: imports,
+the machine is shared), `memory_bytes` the greatest resident size by then. The node is the
+estimator with the engine robot and its map, from its start until its log says `ready`: imports,
 ROS, map and index loaded, and a throw-away run of the filter that makes sure that everything is
 compiled.
 """
@@ -69,8 +71,10 @@ def _row(name: str, command: list[str], quick: bool) -> dict:
 
 def _until_ready(command: list[str]) -> tuple[float, float, int]:
     """
-    (processor time [s], time on the wall [s], memory [bytes]) of a run of Python until it says
-    that it is ready, where it is ended, or else to its end, where its memory is not known (0).
+    Processor time [s], time on the wall [s] and memory [bytes] of a run of Python.
+
+    It is ended when it says that it is ready; one that never does runs to its end, and its memory
+    is not known (0).
     """
     start, process, log, memory = time.perf_counter(), _started(command), b'', 0
     for line in process.stdout:

@@ -40,7 +40,7 @@ SPREAD = np.array([0.02, 0.02, 0.02, 0.05, 0.05, 0.05])  # how far the poor gues
 
 
 def run(quick: bool = False) -> list[dict]:
-    """Rows of name, ours_s, peer, peer_s (seconds), ratio (peer / ours) and spread (its quartiles)."""
+    """Rows of name, ours_s, peer, peer_s (seconds), ratio and spread."""
     repeats = 5 if quick else 25
     with one_core(), threadpool_limits(1):
         return [*_window_rows(repeats), _temporal_row(repeats)]
@@ -81,7 +81,7 @@ def _window_rows(repeats: int) -> list[dict]:
 
 
 def _engine_window() -> tuple[Message, list[Blocks], int]:
-    """The start message and the normal equations of the engine robot's window, and its number of nodes."""
+    """Start message and normal equations of the engine robot's window; its number of nodes."""
     settings = load_estimator_settings('engine')
     estimator = make_filter(load_robot('engine'), scene_map('S0'), settings)
     for sample in simulate(Trial('engine', 'S0', 't2', duration=3.0)):
@@ -101,7 +101,7 @@ def _per_node(nodes: int, dim: int) -> list[int]:
 
 
 class _Gtsam:
-    """The same quadratic as a graph of HessianFactors, each column split into variables at `bounds`."""
+    """The same quadratic as HessianFactors, each column split into variables at `bounds`."""
 
     def __init__(self, start: Message, blocks: list[Blocks], bounds: list[int]):
         import gtsam
@@ -121,7 +121,7 @@ class _Gtsam:
             self._order.push_back(key)
 
     def _add(self, H: np.ndarray, g: np.ndarray, first: int, pieces: list[slice]) -> None:
-        """gtsam minimises 1/2 x^T G x - x^T g, one factor for two variables: the diagonal goes with single ones."""
+        """Add a quadratic; gtsam minimises 1/2 x^T G x - x^T g."""
         make, H = self._gtsam.HessianFactor, np.asarray(H)
         if len(pieces) == 2:  # whole columns: the natural factor of an interval
             a, b = pieces
@@ -156,7 +156,7 @@ class _Gtsam:
         return np.concatenate([values.at(key) for key in range(self._columns * self._per_column)])
 
     def solve_and_covariance(self) -> tuple[object, np.ndarray]:
-        """The solution, and the newest column's covariance (where a column is one variable)."""
+        """Solve; the solution and the newest column's covariance."""
         tree = self._graph.eliminateMultifrontal(self._order)
         last = self._columns - 1
         if self._per_column > 1:
@@ -198,7 +198,7 @@ def _temporal_row(repeats: int) -> dict:
 
 
 def _temporal_problem():
-    """Frame times, measured poses (F, 4, 4), informations (F, 6, 6), guessed poses (K, 4, 4), knot period [s]."""
+    """Make up times, poses (F, 4, 4) and informations (F, 6, 6) of frames; guess; period [s]."""
     rng = np.random.default_rng(0)
     period = 1.0 / (KNOTS - 1)
     times = np.sort(rng.uniform(0.0, 1.0, FRAMES)).clip(1e-3, 1.0 - 1e-3)
@@ -246,7 +246,8 @@ def _linearise(T, v, tau, knot, measured, information, period, q_inverse, H, g):
     for f in range(tau.shape[0]):
         k = knot[f]
         gp.hermite(
-            T[k], v[k], T[k + 1], v[k + 1], period, tau[f], T_now, v_now, J_pose, J_rate, W, V, M, J_work
+            T[k], v[k], T[k + 1], v[k + 1], period, tau[f],
+            T_now, v_now, J_pose, J_rate, W, V, M, J_work,
         )  # fmt: skip
         _pose_error(measured[f], T_now, residual, J_log, W, V, M)
         weighted = J_log.T @ information[f]
@@ -266,7 +267,7 @@ def _pose_error(measured, T, residual, J, W, V, M):
 
 
 def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[], np.ndarray]:
-    """The same problem; gtsam's Pose3 perturbs [rotation; translation], ours [translation; rotation]."""
+    """Pose the same problem to gtsam, whose Pose3 perturbs [rotation; translation]."""
     import gtsam
 
     swap = np.array([3, 4, 5, 0, 1, 2])
@@ -297,7 +298,8 @@ def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[
     def frame(f: int, k: int, tau: float):
         def error(_, values, jacobians):
             gp.hermite(
-                *state(values, k), *state(values, k + 1), period, tau, T_now, v_now, J_pose, J_rate, W, V, M, J_work
+                *state(values, k), *state(values, k + 1), period, tau,
+                T_now, v_now, J_pose, J_rate, W, V, M, J_work,
             )  # fmt: skip
             _pose_error(measured[f], T_now, residual, J_log, W, V, M)
             if jacobians is not None:

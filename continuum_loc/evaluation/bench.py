@@ -6,8 +6,8 @@ A baseline of ratios is committed.
 A benchmark NAME is a file `bench/NAME.py` of the source tree with `run(quick: bool) ->
 list[dict]`. Each row has `name`, `ours_s`, `peer`, `peer_s`, `ratio` (peer over ours, the median
 over interleaved repeats) and `spread` (the ratio's quartiles); a row without a peer has None in
-the last four. `side_by_side` and `alone` make such rows; `exponent` and `memory_bytes` are shown where
-a row has them. An optional `BOUNDS` of the module, a
+the last four. `side_by_side` and `alone` make such rows; `exponent` and `memory_bytes` are shown
+where a row has them. An optional `BOUNDS` of the module, a
 list of (text in the row's name, field, "at least" or "at most", limit), says what the rows are
 meant to show, each judged on the worst row whose name holds the text.
 
@@ -37,7 +37,8 @@ import numpy as np
 BENCH_FOLDER = Path(__file__).parents[2] / 'bench'
 BASELINE = BENCH_FOLDER / 'baseline.json'
 SHORTEST = 5e-3  # [s] that an action is timed for, by as many calls as that takes
-SLACK = 0.25  # a ratio may fall by this share, or out of both runs' quartiles, whichever is more, before it counts
+# A ratio may fall by this share, or out of both runs' quartiles, whichever is more.
+SLACK = 0.25
 
 
 @contextmanager
@@ -121,7 +122,7 @@ class BenchOutcome:
     failures: list[str]
 
     def regressions(self, baseline: Path = BASELINE) -> list[str]:
-        """A line for each ratio that fell clearly below the committed one."""
+        """List the ratios that fell clearly below the committed ones, a line for each."""
         known = read_baseline(baseline)
         return [
             f'{row["name"]} against {row["peer"]}: ratio {row["ratio"]:.2f}, '

@@ -54,8 +54,9 @@ CONE_TILT = 0.366  # of the axis of a quarter of a cube's face: (1, tilt, tilt)
 
 class VoxelArrays(NamedTuple):
     """
-    The index as arrays and scalars. Kernels take it whole; only the last five arrays are ever
-    written.
+    The index as arrays and scalars.
+
+    Kernels take it whole; only the last five arrays are ever written.
 
     points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; normals: (P, 3).
     block_slots: (H, 2) hash table from a block's key to its number.
@@ -163,7 +164,7 @@ def _range(u, reach, count):
 
 @njit(cache=True)
 def _collect(arrays, u, v, w, reach, seen2):
-    """Write to `scratch` the blocks nearer than `reach`, but not than sqrt(seen2); their number."""
+    """Write the blocks nearer than `reach`, but not than sqrt(seen2), to `scratch`; count them."""
     slots, scratch, count, reach2 = arrays.block_slots, arrays.scratch, 0, reach * reach
     i0, i1 = _range(u, reach, arrays.blocks_x)
     j0, j1 = _range(v, reach, arrays.blocks_y)
@@ -212,7 +213,7 @@ def _toward(normals, p, dx, dy, dz):
 
 @njit(cache=True)
 def _scan(points, normals, begin, end, x, y, z, dx, dy, dz, min_cos, best, best2, row):
-    """Improve (place, squared distance, caller's row) of the nearest by points begin..end that face the beam."""
+    """Improve (place, squared distance, caller's row) by points begin..end that face the beam."""
     for p in range(begin, end):
         d2 = _distance2(points, p, x, y, z)
         if d2 <= best2 and (d2 < best2 or points[p, 3] < row):
@@ -224,9 +225,10 @@ def _scan(points, normals, begin, end, x, y, z, dx, dy, dz, min_cos, best, best2
 @njit(cache=True)
 def _search(arrays, x, y, z, dx, dy, dz, min_cos, limit2):
     """
-    (sorted point or -1, squared distance, caller's row) of the nearest that faces the beam and is
-    nearer than sqrt(limit2), in balls that grow until one is sure to hold it. With min_cos = -1
-    every point counts.
+    Find the nearest that faces the beam: (sorted point or -1, squared distance, caller's row).
+
+    It is nearer than sqrt(limit2), and looked for in balls that grow until one is sure to hold it.
+    With min_cos = -1 every point counts.
     """
     scale, points, normals, start = (
         arrays.inverse_block,
@@ -262,7 +264,7 @@ def _search(arrays, x, y, z, dx, dy, dz, min_cos, limit2):
 
 @njit(cache=True)
 def _cone(dx, dy, dz):
-    """Number 0..23 of the cone that holds a direction: a quarter of a face of the cube around it."""
+    """Find the cone, 0..23, that holds a direction: a quarter of a face of the cube around it."""
     x, y, z = abs(dx), abs(dy), abs(dz)
     if x >= y and x >= z:
         return ((0 if dx > 0 else 1) << 2) | ((dy > 0) << 1) | (dz > 0)
@@ -273,7 +275,7 @@ def _cone(dx, dy, dz):
 
 @njit(cache=True)
 def _cone_axis(cone):
-    """Unit axis of a cone; zero for ANY_DIRECTION."""
+    """Return the unit axis of a cone; zero for ANY_DIRECTION."""
     if cone == ANY_DIRECTION:
         return 0.0, 0.0, 0.0
     scale = 1.0 / np.sqrt(1.0 + 2.0 * CONE_TILT * CONE_TILT)
@@ -291,8 +293,10 @@ def _cone_axis(cone):
 @njit(cache=True)
 def _cone_limits(cone, min_cos):
     """
-    (may, sure): from which cosine to the cone's axis on a surface may face some direction of the
-    cone, and from which on it is sure to face all of them. The latter is 2 where none is.
+    Bounds (may, sure) on the cosine between a surface and the cone's axis.
+
+    From `may` on it may face some direction of the cone, from `sure` on it faces all of them; the
+    latter is 2 where none does.
     """
     if cone == ANY_DIRECTION:
         return -2.0, -1.0
@@ -326,8 +330,9 @@ def _copy(points, normals, p, pool, pool_normals, to):
 @njit(cache=True)
 def _make_list(arrays, x, y, z, cone, min_cos, begin):
     """
-    Write the candidates of the cell with this centre from pool row `begin` on: their number (0: no
-    point within reach), or -1 where they are too many.
+    Write the candidates of the cell with this centre from pool row `begin` on.
+
+    Their number (0: no point within reach), or -1 where they are too many.
     """
     pool, pool_normals, edge = arrays.pool, arrays.pool_normals, arrays.cell
     ax, ay, az = _cone_axis(cone)
@@ -352,8 +357,10 @@ def _make_list(arrays, x, y, z, cone, min_cos, begin):
 @njit(cache=True)
 def _gather(arrays, x, y, z, radius, ax, ay, az, may, best, begin):
     """
-    Write to the pool the points within `radius` that may face, but for those that `best` (already
-    at row `begin`, or -1) rules out. The end of what was written, or -1 when they are too many.
+    Write to the pool the points within `radius` that may face.
+
+    Not those that `best` (already at row `begin`, or -1) rules out. The end of what was written,
+    or -1 when they are too many.
     """
     points, normals, scale = arrays.points, arrays.normals, arrays.inverse_block
     pool, pool_normals, start = arrays.pool, arrays.pool_normals, arrays.block_start
@@ -378,7 +385,7 @@ def _gather(arrays, x, y, z, radius, ax, ay, az, may, best, begin):
 
 @njit(cache=True)
 def _sort_rows(pool, pool_normals, begin, end):
-    """Bring a list into the order of the caller's rows, so that the first of equally near ones wins."""
+    """Bring a list into the caller's order, so that the first of equally near ones wins."""
     for c in range(begin + 1, end):
         at = c
         while at > begin and pool[at - 1, 3] > pool[at, 3]:
@@ -399,7 +406,7 @@ def _swap(pool, pool_normals, a, b):
 
 @njit(cache=True)
 def _prune(pool, pool_normals, begin, end, x, y, z, edge, ax, ay, az, sure):
-    """Drop the rows ruled out by the sure one that is nearest to some corner of the box; the new end."""
+    """Drop rows ruled out by the sure one that is nearest to a corner of the box; the new end."""
     for corner in range(8):
         qx = x + edge * ((corner & 1) - 0.5)
         qy = y + edge * (((corner >> 1) & 1) - 0.5)
@@ -473,7 +480,7 @@ def _add_list(arrays, key, min_cos):
 
 @njit(cache=True)
 def _list_key(x0, y0, z0, inverse_cell, x, y, z, cone):
-    """Key of the cell that holds a place, with a cone; -1 for nan and for places absurdly far away."""
+    """Key of the cell that holds a place, with a cone; -1 for nan and places absurdly far away."""
     i = np.floor((x - x0) * inverse_cell)
     j = np.floor((y - y0) * inverse_cell)
     k = np.floor((z - z0) * inverse_cell)
@@ -498,7 +505,7 @@ def _nearest_listed(pool, begin, end, x, y, z, limit2):
 
 @njit(cache=True)
 def _facing_listed(pool, normals, begin, end, x, y, z, dx, dy, dz, min_cos, limit2):
-    """The same among those that face the beam."""
+    """Look, as `_nearest_listed` does, among those that face the beam."""
     best, best2 = -1, limit2
     for c in range(begin, end):
         d2 = _distance2(pool, c, x, y, z)
@@ -510,7 +517,7 @@ def _facing_listed(pool, normals, begin, end, x, y, z, dx, dy, dz, min_cos, limi
 @njit(cache=True)
 def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, index, distance2):
     """
-    The nearest point to each query (Q, 3), of those that face its direction where `facing`.
+    Find the nearest point to each query (Q, 3); where `facing`, of those that face its direction.
 
     `arrays` is unpacked here and not per lookup, which halves the time of one that finds its list.
     """
@@ -556,9 +563,10 @@ def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, i
 @njit(cache=True)
 def nearest_batch(arrays, queries, max_distance, index, distance2):
     """
-    Rows index (Q,) of the nearest points in the caller's cloud and distance2 (Q,) [m^2] for
-    queries (Q, 3); -1 and inf where none lies strictly within `max_distance` [m] or a query is not
-    finite.
+    Find the nearest points to queries (Q, 3): their rows index (Q,) and distance2 (Q,) [m^2].
+
+    The rows are the caller's; -1 and inf where none lies strictly within `max_distance` [m] or a
+    query is not finite.
     """
     _nearest_batch(arrays, False, queries, queries, max_distance, -1.0, index, distance2)
 
@@ -635,8 +643,10 @@ class VoxelIndex:
         self, queries: np.ndarray, max_distance: float = np.inf
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3); -1 and inf where
-        none is nearer than max_distance [m]. Of equally near points the first is taken.
+        Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3).
+
+        They are -1 and inf where none is nearer than max_distance [m]. Of equally near points the
+        first is taken.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
@@ -757,7 +767,7 @@ def _empty_cache(cells: int, blocks: int) -> dict[str, np.ndarray]:
 
 
 def spatial_order(points: np.ndarray, edge: float) -> np.ndarray:
-    """(P,) rows of the points along a Morton curve through cubes of this edge [m]: neighbours lie close in memory."""
+    """Rows (P,) of the points along a Morton curve through cubes of this edge [m]."""
     return np.argsort(_morton_codes(points, points.min(axis=0), 1.0 / edge), kind='stable')
 
 

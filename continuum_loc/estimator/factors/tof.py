@@ -345,8 +345,78 @@ def _add(
 
 
 @njit(cache=True)
+def _add_clocks(
+    gradient,
+    information,
+    coupling,
+    sensors,
+    T_a,
+    v_a,
+    T_b,
+    v_b,
+    dt,
+    times,
+    nodes,
+    q,
+    rays,
+    variance,
+    weights,
+    cloud,
+    normals,
+    planarity,
+    map_variance,
+    floor2,
+    footprint,
+    cauchy,
+    gate,
+    hits,
+):
+    """Add each frame's v^T g, v^T H v and J^T H v to its sensor's, v the body's velocity then."""
+    W, V, M = lie_kernels.workspace()
+    J_work = np.empty((2, 6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    index, fit = np.empty(24, np.int64), np.empty(2)
+    H, g, Hv = np.empty((6, 6)), np.empty(6), np.empty(6)
+    for f in range(times.shape[0]):
+        n, s = nodes[f], sensors[f]
+        gp.hermite(
+            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work
+        )
+        frame_information(
+            T,
+            q[f],
+            rays[f],
+            variance[f],
+            hits[f],
+            weights[f],
+            cloud,
+            normals,
+            planarity,
+            map_variance,
+            floor2,
+            footprint,
+            cauchy,
+            gate,
+            H,
+            g,
+            fit,
+        )
+        lie_kernels.apply(H, v, Hv)
+        gp.time_index(n, VELOCITY, coupling.shape[0] // 2, index)
+        for i in range(6):
+            gradient[s] += g[i] * v[i]
+            information[s] += Hv[i] * v[i]
+            for j in range(24):
+                coupling[index[j], s] += J_pose[i, j] * Hv[i]
+
+
+@njit(cache=True)
 def associate(T, q, rays, variance, arrays, gate, min_cosine, hits):
-    """Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body; -1 where there is none."""
+    """
+    Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body.
+
+    -1 where there is none.
+    """
     zones = q.shape[0]
     points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
     for z in range(zones):
