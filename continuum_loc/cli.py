@@ -428,7 +428,9 @@ def bench(
     check: Annotated[
         bool, typer.Option('--check', help='compare with the committed baseline')
     ] = False,
-    baseline: Annotated[bool, typer.Option('--baseline', help='commit to these ratios')] = False,
+    baseline: Annotated[
+        bool, typer.Option('--baseline', help='keep these ratios, and put them into docs/speed.md')
+    ] = False,
     peers: Annotated[bool, typer.Option(help='install what we are compared with')] = True,
 ) -> None:
     """
@@ -452,6 +454,7 @@ def bench(
         errors.print(f'[bold red]failed:[/] {escape(line)}', highlight=False)
     if baseline:
         benches.write_baseline(outcome.rows, partial=only is not None)
+        benches.write_document(outcome.rows)
     regressions = outcome.regressions() if check else []
     for line in regressions:
         errors.print(f'[bold red]slower than the baseline:[/] {escape(line)}', highlight=False)

@@ -36,6 +36,7 @@ import numpy as np
 
 BENCH_FOLDER = Path(__file__).parents[2] / 'bench'
 BASELINE = BENCH_FOLDER / 'baseline.json'
+DOCUMENT = BENCH_FOLDER.parent / 'docs' / 'speed.md'
 SHORTEST = 5e-3  # [s] that an action is timed for, by as many calls as that takes
 # A ratio may fall by this share, or out of both runs' quartiles, whichever is more.
 SLACK = 0.25
@@ -273,3 +274,30 @@ def write_baseline(
                 'spread': [float(f'{quartile:.4g}') for quartile in row['spread']],
             }
     path.write_text(json.dumps(list(kept.values()), indent=1) + '\n')
+
+
+def write_document(rows: list[dict[str, Any]], path: Path = DOCUMENT) -> None:
+    """
+    Put the tables of the benchmarks that ran into the document, each between its two markers.
+
+    Raises BenchError where a benchmark has no markers there.
+    """
+    text = path.read_text()
+    for name in dict.fromkeys(row['benchmark'] for row in rows):
+        begin, end = f'<!-- bench {name} -->\n', f'<!-- end {name} -->'
+        head, found, rest = text.partition(begin)
+        _, closed, tail = rest.partition(end)
+        if not (found and closed):
+            raise BenchError(
+                f'{path}: no lines {begin.strip()} and {end} to put the table between'
+            )
+        lines = markdown(table([row for row in rows if row['benchmark'] == name]))
+        text = f'{head}{begin}{lines}{end}{tail}'
+    path.write_text(text)
+
+
+def markdown(cells: list[dict[str, str]]) -> str:
+    """Table of these rows, without the columns in which nobody has anything."""
+    names = [name for name in cells[0] if any(row[name] != '-' for row in cells)]
+    lines = [names, ['---'] * len(names), *([row[name] for name in names] for row in cells)]
+    return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
