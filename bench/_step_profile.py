@@ -12,6 +12,7 @@ import cProfile
 from pathlib import Path
 import pstats
 import sys
+from time import process_time
 
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.evaluation.bench import one_core
@@ -51,7 +52,7 @@ def main(picture: Path) -> None:
     estimator = make_filter(
         load_robot('engine'), scene_map('S0'), load_estimator_settings('engine')
     )
-    profile, steps = cProfile.Profile(), 0
+    profile, steps = cProfile.Profile(process_time), 0
     with one_core():
         for k, sample in enumerate(samples):
             if k == len(samples) // 4:
