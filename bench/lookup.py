@@ -254,11 +254,7 @@ def _compare_facing(prior, index, peer, query, batches, repeats) -> list[dict]:
     rng = np.random.default_rng(2)
     rows, _ = index.nearest(_filter_zones(prior)[0], MAX_DISTANCE)
     beams = _unit(-prior.normals[rows] + 0.3 * rng.normal(size=(len(rows), 3)))
-    ours: Query = lambda q: index.nearest_facing(q, beams, BOUNDS = [
-    (f'lookup, {workload}', 'ratio', 'at least', 3.0)
-    for workload in ('filter', 'scattered', 'first visit', 'facing')
-]
-MAX_DISTANCE, MIN_COS)  # noqa: E731
+    ours: Query = lambda q: index.nearest_facing(q, beams, MAX_DISTANCE, MIN_COS)  # noqa: E731
     name, found = 'lookup, facing the beam', [_compare_any(prior, beams, ours, batches)]
     return [
         _compare(name, ours, f'{peer}, any point', query, batches, repeats),
