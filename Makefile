@@ -1,5 +1,5 @@
-# make demo | test | lint | bench | bench-check | install | clean. Everything runs in .venv, which `install` makes.
-.PHONY: install demo test lint bench bench-check clean
+# make demo | test | lint | bench | bench-check | profile | install | clean. Everything runs in .venv, which `install` makes.
+.PHONY: install demo test lint bench bench-check profile clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
@@ -44,6 +44,9 @@ bench: install
 
 bench-check: install
 	$(RUN)/continuum-loc bench --check
+
+profile: install
+	$(RUN)/python bench/_step_profile.py
 
 clean:
 	rm -rf $(VENV) build dist install log .pytest_cache .ruff_cache .hypothesis .cache *.egg-info

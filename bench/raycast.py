@@ -15,9 +15,8 @@ Ours also looks up normals and faces; MuJoCo's casters are asked for distances a
 from __future__ import annotations
 
 from collections.abc import Callable
-import time
 
-from continuum_loc.evaluation.bench import one_core
+from continuum_loc.evaluation.bench import one_core, side_by_side
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.raycast import cast_capsules, RayCaster
 from continuum_loc.simulator.scene import Scene, scene_of_solid
@@ -45,21 +44,25 @@ def run(quick: bool = False) -> list[dict]:
         ):
             ours = _ours(caster, *fan)
             rows.append(
-                _compare(name, ours, 'Open3D RaycastingScene', _open3d(scene, *fan), 5 * repeats)
+                side_by_side(
+                    name, ours, 'Open3D RaycastingScene', _open3d(scene, *fan), 5 * repeats
+                )
             )
             rows.append(
-                _compare(name, ours, 'mj_multiRay', _multi_ray(model, data, *fan), slow_repeats)
+                side_by_side(
+                    name, ours, 'mj_multiRay', _multi_ray(model, data, *fan), slow_repeats
+                )
             )
         ours = _ours(caster, *frame)
         rows.append(
-            _compare('rays, frame', ours, 'mj_ray', _single_rays(model, data, *frame), repeats)
+            side_by_side('rays, frame', ours, 'mj_ray', _single_rays(model, data, *frame), repeats)
         )
         rows.append(
-            _compare(
+            side_by_side(
                 'rays, frame', ours, 'MuJoCo rangefinders', _rangefinders(scene, *frame), repeats
             )
         )
-        rows.append(_compare('rays, body', *_body(*frame), 5 * repeats))
+        rows.append(side_by_side('rays, body', *_body(*frame), 5 * repeats))
     return rows
 
 
@@ -215,27 +218,6 @@ def _body(origins: np.ndarray, rays: np.ndarray) -> tuple[Action, str, Action]:
         'mj_multiRay',
         _multi_ray(model, data, origins, rays),
     )
-
-
-def _compare(name: str, ours: Action, peer: str, theirs: Action, repeats: int) -> dict:
-    """Alternate the two: median times, and the ratio's median and quartiles over the repeats."""
-    ours(), theirs()
-    times = np.array([(_seconds(ours), _seconds(theirs)) for _ in range(repeats)])
-    ratio = times[:, 1] / times[:, 0]
-    return {
-        'name': name,
-        'ours_s': float(np.median(times[:, 0])),
-        'peer': peer,
-        'peer_s': float(np.median(times[:, 1])),
-        'ratio': float(np.median(ratio)),
-        'spread': [float(quartile) for quartile in np.quantile(ratio, [0.25, 0.75])],
-    }
-
-
-def _seconds(action: Action) -> float:
-    started = time.perf_counter()
-    action()
-    return time.perf_counter() - started
 
 
 if __name__ == '__main__':

@@ -19,9 +19,9 @@ which they behave best, and `trust-constr` to its own default tolerances.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from time import perf_counter
+from time import process_time
 
-from continuum_loc.evaluation.bench import one_core
+from continuum_loc.evaluation.bench import alone, one_core, side_by_side
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.shape import ShapeEstimator, ShapeSettings
 from continuum_loc.shape.magnet import field_and_gradient
@@ -81,21 +81,14 @@ def _whole_estimate(robot: RobotDescription, repeats: int) -> dict:
             [],
         )
         for sample in samples:
-            begin = perf_counter()
+            begin = process_time()
             estimate = estimator.process(sample)
-            spent += perf_counter() - begin
+            spent += process_time() - begin
             if estimate is not None:
                 costs.append(spent)
                 spent = 0.0
         times.append(float(np.median(costs)))
-    return {
-        'name': 'shape, whole estimate',
-        'ours_s': float(np.median(times[1:])),
-        'peer': None,
-        'peer_s': None,
-        'ratio': None,
-        'spread': None,
-    }
+    return alone('shape, whole estimate', np.median(times[1:]))
 
 
 def _problems(robot: RobotDescription, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -179,36 +172,20 @@ def _compare(
     problems: list[tuple[np.ndarray, np.ndarray]],
     repeats: int,
 ) -> dict:
-    """
-    Alternate ours and the peer's over all problems.
-
-    Ours repeats them, being quicker than the clock's noise.
-    """
+    """Ours and the peer's over all problems, and how far apart their answers are."""
     gaps = [
         np.linalg.norm(solver.solve(*problem).position - theirs(*problem), axis=1).max()
         for problem in problems
     ]
-    times = np.empty((repeats, 2))
-    for row in times:
-        begin = perf_counter()
-        for _ in range(20):
-            for problem in problems:
-                solver.solve(*problem)
-        middle = perf_counter()
-        for problem in problems:
-            theirs(*problem)
-        row[:] = (middle - begin) / (20 * len(problems)), (perf_counter() - middle) / len(problems)
-    ratio = times[:, 1] / times[:, 0]
-    low, high = np.quantile(ratio, [0.25, 0.75])
-    return {
-        'name': name,
-        'ours_s': float(np.median(times[:, 0])),
-        'peer': f'SciPy {peer}',
-        'peer_s': float(np.median(times[:, 1])),
-        'ratio': float(np.median(ratio)),
-        'spread': [float(low), float(high)],
-        'agreement_m': float(max(gaps)),
-    }
+    return side_by_side(
+        name,
+        lambda: [solver.solve(*problem) for problem in problems],
+        f'SciPy {peer}',
+        lambda: [theirs(*problem) for problem in problems],
+        repeats,
+        per_call=len(problems),
+        agreement_m=float(max(gaps)),
+    )
 
 
 if __name__ == '__main__':

@@ -428,7 +428,9 @@ def bench(
     check: Annotated[
         bool, typer.Option('--check', help='compare with the committed baseline')
     ] = False,
-    baseline: Annotated[bool, typer.Option('--baseline', help='commit to these ratios')] = False,
+    baseline: Annotated[
+        bool, typer.Option('--baseline', help='keep these ratios, and put them into docs/speed.md')
+    ] = False,
     peers: Annotated[bool, typer.Option(help='install what we are compared with')] = True,
 ) -> None:
     """
@@ -440,6 +442,8 @@ def bench(
     from continuum_loc.evaluation.runs import new_run
 
     names = benches.bench_names()
+    if check:
+        benches.read_baseline()  # before the work, not after it
     if peers:
         benches.install_peers()
     outcome = benches.run_bench(out or new_run('bench'), quick, only, _each)
@@ -449,7 +453,8 @@ def bench(
     for line in outcome.failures:
         errors.print(f'[bold red]failed:[/] {escape(line)}', highlight=False)
     if baseline:
-        benches.write_baseline(outcome.rows)
+        benches.write_baseline(outcome.rows, partial=only is not None)
+        benches.write_document(outcome.rows)
     regressions = outcome.regressions() if check else []
     for line in regressions:
         errors.print(f'[bold red]slower than the baseline:[/] {escape(line)}', highlight=False)

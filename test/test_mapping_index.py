@@ -48,8 +48,8 @@ def clouds():
     st.sampled_from([1e-3, 0.05, 0.3, 2.0, np.inf]),
     st.sampled_from([None, 0.02, 0.5, 7.0]),
 )
-def test_nearest_is_the_nearest_of_any_cloud(points, queries, max_distance, voxel):
-    index = VoxelIndex(points, voxel=voxel, reach=0.2)
+def test_nearest_is_the_nearest_of_any_cloud(points, queries, max_distance, cell):
+    index = VoxelIndex(points, cell=cell, reach=0.2)
     for _ in range(PATIENCE + 1):  # first by search, then from the lists
         row, distance = index.nearest(queries, max_distance)
         expected = brute_force(points, queries, max_distance)
@@ -103,6 +103,35 @@ def test_the_centre_of_a_sphere_where_every_point_is_a_candidate():
     np.testing.assert_allclose(distance, cKDTree(points).query(queries)[0], rtol=1e-12)
 
 
+def test_of_equally_near_points_the_first_is_taken_whatever_the_cache_holds():
+    axis = np.arange(-2.0, 3.0)
+    lattice = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    points = np.random.default_rng(7).permutation(np.concatenate([lattice, lattice]))
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    queries = lattice[:40] + 0.5  # eight places are equally near, and two points are at each
+    distance = np.linalg.norm(queries[:, None] - points[None], axis=2)
+    expected = np.argmax(distance == distance.min(axis=1, keepdims=True), axis=1)
+    index = VoxelIndex(points, normals, reach=2.0)
+    for _ in range(PATIENCE + 2):
+        np.testing.assert_array_equal(index.nearest(queries)[0], expected)
+        np.testing.assert_array_equal(index.nearest_facing(queries, [0, 0, -1.0])[0], expected)
+    assert index.cache_use['made'] > 0
+
+
+def test_lists_made_for_one_angle_of_incidence_do_not_serve_another():
+    points, normals = wavy_cylinder(2000, 8)
+    rng = np.random.default_rng(9)
+    queries = points[:50] + rng.normal(0, 0.02, (50, 3))
+    directions = -normals[:50]
+    cosine = -np.einsum('qi,pi->qp', directions, normals)
+    index = VoxelIndex(points, normals)
+    for min_cos in (0.9999, 0.1, -0.5, 0.9999):
+        expected = brute_force(points, queries, 0.1, cosine >= min_cos)
+        for _ in range(PATIENCE + 1):
+            _, distance = index.nearest_facing(queries, directions, 0.1, min_cos)
+            np.testing.assert_allclose(distance, expected, rtol=1e-12)
+
+
 def test_a_cache_that_overflows_changes_nothing():
     points, _ = wavy_cylinder(20_000, 4)
     queries = points[:4000] + np.random.default_rng(5).normal(0, 0.01, (4000, 3))
@@ -125,7 +154,7 @@ def test_copies_share_the_cloud_and_not_the_cache():
 
 @pytest.mark.parametrize('query', [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300]])
 def test_a_query_that_is_no_place_has_no_neighbour(query):
-    row, distance = VoxelIndex(np.zeros((1, 3)), voxel=0.1).nearest(np.array([query]))
+    row, distance = VoxelIndex(np.zeros((1, 3)), cell=0.1).nearest(np.array([query]))
     assert row[0] == -1 and distance[0] == np.inf
 
 
@@ -148,9 +177,9 @@ def test_unusable_points_are_refused_by_name(points, said):
         VoxelIndex(points)
 
 
-def test_a_voxel_too_small_for_the_cloud_is_refused():
+def test_a_cell_too_small_for_the_cloud_is_refused():
     with pytest.raises(MapError, match='too small'):
-        VoxelIndex(np.array([[0.0, 0, 0], [1e4, 0, 0]]), voxel=1e-4)
+        VoxelIndex(np.array([[0.0, 0, 0], [1e4, 0, 0]]), cell=1e-4)
 
 
 def test_facing_needs_normals():

@@ -15,8 +15,11 @@ from continuum_loc.evaluation.bench import (
     BenchOutcome,
     bound_claims,
     duration,
+    read_baseline,
     run_bench,
+    side_by_side,
     write_baseline,
+    write_document,
 )
 from continuum_loc.evaluation.campaign import Outcome, run_campaign
 from continuum_loc.evaluation.error_tables import condition_table, figures, mean, trial_rows
@@ -220,6 +223,49 @@ def test_regressions_are_falls_beyond_slack_and_spread(tmp_path):
     assert not regressions(row(name='new', ratio=0.1, spread=(0.1, 0.1)))
     with pytest.raises(BenchError, match='no baseline'):
         BenchOutcome([], [], []).regressions(tmp_path / 'nothing.json')
+
+
+def test_what_has_become_slower_shows_whatever_the_machine_does_meanwhile(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr('continuum_loc.evaluation.bench.process_time', lambda: clock[0])
+    noise = np.random.default_rng(0)
+
+    def lasting(seconds):
+        def work():  # a busy machine slows down both
+            clock[0] += seconds * noise.uniform(1.0, 1.3)
+
+        return work
+
+    def measured(seconds):
+        return side_by_side('look', lasting(seconds), 'them', lasting(3e-3), repeats=15)
+
+    baseline = tmp_path / 'baseline.json'
+    write_baseline([measured(1e-3)], baseline)
+    assert not BenchOutcome([measured(1e-3)], [], []).regressions(baseline)
+    lines = BenchOutcome([measured(1.5e-3)], [], []).regressions(baseline)
+    assert len(lines) == 1 and 'look against them' in lines[0]
+
+
+def test_a_partial_baseline_keeps_what_was_not_measured_again(tmp_path):
+    baseline = tmp_path / 'baseline.json'
+    write_baseline([row('a', 2.0), row('b', 3.0)], baseline)
+    write_baseline([row('b', 4.0)], baseline, partial=True)
+    assert {key[0]: one['ratio'] for key, one in read_baseline(baseline).items()} == {
+        'a': 2.0,
+        'b': 4.0,
+    }
+
+
+def test_the_document_takes_each_table_between_its_markers(tmp_path):
+    document = tmp_path / 'speed.md'
+    document.write_text('Before\n<!-- bench a -->\nold\n<!-- end a -->\nafter\n')
+    write_document([row() | {'benchmark': 'a'}], document)
+    text = document.read_text()
+    assert 'old' not in text and text.startswith('Before\n') and text.endswith('after\n')
+    assert '| lookup | 1 us | them | 3 us | 3 | 2.8 to 3.2 |' in text
+    assert 'memory' not in text  # nobody has any
+    with pytest.raises(BenchError, match='bench b'):
+        write_document([row() | {'benchmark': 'b'}], document)
 
 
 def test_one_broken_benchmark_does_not_stop_the_others(tmp_path, monkeypatch):

@@ -377,7 +377,7 @@ def _score(
     out = np.zeros(T.shape[0])
     for m in range(T.shape[0]):
         for f in range(q.shape[0]):
-            associate(T[m], q[f], rays[f], variance[f], arrays, normals, gate, min_cosine, hits)
+            associate(T[m], q[f], rays[f], variance[f], arrays, gate, min_cosine, hits)
             cost, _, _ = frame_information(
                 T[m],
                 q[f],

@@ -6,9 +6,13 @@ A baseline of ratios is committed.
 A benchmark NAME is a file `bench/NAME.py` of the source tree with `run(quick: bool) ->
 list[dict]`. Each row has `name`, `ours_s`, `peer`, `peer_s`, `ratio` (peer over ours, the median
 over interleaved repeats) and `spread` (the ratio's quartiles); a row without a peer has None in
-the last four. An optional `BOUNDS` of the module, a list of (text in the row's name, field, "at
-least" or "at most", limit), says what the rows are meant to show, each judged on the worst row
-whose name holds the text.
+the last four. `side_by_side` and `alone` make such rows; `exponent` and `memory_bytes` are shown
+where a row has them. An optional `BOUNDS` of the module, a
+list of (text in the row's name, field, "at least" or "at most", limit), says what the rows are
+meant to show, each judged on the worst row whose name holds the text.
+
+Times are processor time of this process, on one core (`one_core`): what one would wait for on a
+quiet machine, whoever else uses this one.
 """
 
 from __future__ import annotations
@@ -22,15 +26,19 @@ import os
 from pathlib import Path
 import subprocess
 import sys
+from time import process_time
 import traceback
 from types import ModuleType
 from typing import Any
 
 from continuum_loc.evaluation.study import at_least, at_most, Claim, write_study
+import numpy as np
 
 BENCH_FOLDER = Path(__file__).parents[2] / 'bench'
 BASELINE = BENCH_FOLDER / 'baseline.json'
-# A ratio's fall counts beyond this share, or out of both runs' quartiles, whichever is more.
+DOCUMENT = BENCH_FOLDER.parent / 'docs' / 'speed.md'
+SHORTEST = 5e-3  # [s] that an action is timed for, by as many calls as that takes
+# A ratio may fall by this share, or out of both runs' quartiles, whichever is more.
 SLACK = 0.25
 
 
@@ -43,6 +51,63 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, cores)
+
+
+def side_by_side(
+    name: str,
+    ours: Callable[[], object],
+    peer: str,
+    theirs: Callable[[], object],
+    repeats: int,
+    per_call: int = 1,
+    **more: Any,
+) -> dict[str, Any]:
+    """
+    Row of two actions timed in turn, after one call each that is not counted.
+
+    Every repeat takes the two in the other order, and each long enough for the clock.
+    per_call: units of work in a call (the row states seconds per unit); more: further fields.
+    """
+    actions = (ours, theirs)
+    calls = [_calls_worth_timing(action) for action in actions]
+    times = np.empty((repeats, 2))
+    for k in range(repeats):
+        for which in (0, 1) if k % 2 == 0 else (1, 0):
+            times[k, which] = seconds_of(actions[which], calls[which]) / per_call
+    return paired(name, peer, times, **more)
+
+
+def paired(name: str, peer: str, times: np.ndarray, **more: Any) -> dict[str, Any]:
+    """Row of interleaved times (repeats, 2) [s], ours and the peer's; more: further fields."""
+    ratio = times[:, 1] / times[:, 0]
+    return {
+        'name': name,
+        'ours_s': float(np.median(times[:, 0])),
+        'peer': peer,
+        'peer_s': float(np.median(times[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'spread': [float(quartile) for quartile in np.quantile(ratio, [0.25, 0.75])],
+        **more,
+    }
+
+
+def alone(name: str, seconds: float, **more: Any) -> dict[str, Any]:
+    """Row of something that has no peer; more: further fields."""
+    nobody = dict.fromkeys(('peer', 'peer_s', 'ratio', 'spread'))
+    return {'name': name, 'ours_s': float(seconds), **nobody, **more}
+
+
+def seconds_of(action: Callable[[], object], calls: int = 1) -> float:
+    """Processor time of a call [s], the mean over so many."""
+    started = process_time()
+    for _ in range(calls):
+        action()
+    return (process_time() - started) / calls
+
+
+def _calls_worth_timing(action: Callable[[], object]) -> int:
+    action()  # may compile, allocate, or fill a cache
+    return max(1, int(np.ceil(SHORTEST / max(seconds_of(action), 1e-9))))
 
 
 class BenchError(ValueError):
@@ -58,13 +123,8 @@ class BenchOutcome:
     failures: list[str]
 
     def regressions(self, baseline: Path = BASELINE) -> list[str]:
-        """List a line for each ratio that fell clearly below the committed one."""
-        if not baseline.is_file():
-            raise BenchError(
-                f'{baseline}: no baseline to compare with; '
-                'write one by `continuum-loc bench --baseline`'
-            )
-        known = {(row['name'], row['peer']): row for row in json.loads(baseline.read_text())}
+        """List the ratios that fell clearly below the committed ones, a line for each."""
+        known = read_baseline(baseline)
         return [
             f'{row["name"]} against {row["peer"]}: ratio {row["ratio"]:.2f}, '
             f'baseline {old["ratio"]:.2f}'
@@ -96,10 +156,10 @@ def bench_names() -> list[str]:
 def install_peers() -> None:
     """Install the libraries that we are compared with, which nothing else needs."""
     wanted = BENCH_FOLDER / 'requirements.txt'
+    pinned = BENCH_FOLDER.parent / 'requirements.txt'  # stays as it is, whatever a peer would like
     if wanted.is_file():
-        subprocess.run(
-            [sys.executable, '-m', 'pip', 'install', '--quiet', '-r', str(wanted)], check=True
-        )
+        files = ['-r', str(wanted), *(['-c', str(pinned)] if pinned.is_file() else [])]
+        subprocess.run([sys.executable, '-m', 'pip', 'install', '--quiet', *files], check=True)
 
 
 def run_bench(
@@ -172,6 +232,10 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
             'quartiles': '-'
             if row.get('ratio') is None
             else '{:.3g} to {:.3g}'.format(*row['spread']),
+            'exponent': '-' if row.get('exponent') is None else f'{row["exponent"]:.2f}',
+            'memory': '-'
+            if row.get('memory_bytes') is None
+            else f'{row["memory_bytes"] / 1e6:.0f} MB',
         }
         for row in rows
     ]
@@ -187,11 +251,53 @@ def duration(seconds: float | None) -> str:
     return f'{seconds:.3g} s'
 
 
-def write_baseline(rows: list[dict[str, Any]], path: Path = BASELINE) -> None:
-    """Make these ratios the ones that later runs are compared with."""
-    kept = [
-        {key: row[key] for key in ('name', 'peer', 'ratio', 'spread')}
-        for row in rows
-        if row.get('ratio') is not None
-    ]
-    path.write_text(json.dumps(kept, indent=1) + '\n')
+def read_baseline(path: Path = BASELINE) -> dict[tuple[str, str], dict[str, Any]]:
+    """Rows of a baseline by (name, peer). Raises BenchError where there is none."""
+    if not path.is_file():
+        raise BenchError(
+            f'{path}: no baseline to compare with; write one by `continuum-loc bench --baseline`'
+        )
+    return {(row['name'], row['peer']): row for row in json.loads(path.read_text())}
+
+
+def write_baseline(
+    rows: list[dict[str, Any]], path: Path = BASELINE, partial: bool = False
+) -> None:
+    """Make these ratios the ones that later runs are compared with; `partial` keeps the others."""
+    kept = read_baseline(path) if partial and path.is_file() else {}
+    for row in rows:
+        if row.get('ratio') is not None:
+            short = {key: row[key] for key in ('name', 'peer')}
+            kept[row['name'], row['peer']] = {
+                **short,
+                'ratio': float(f'{row["ratio"]:.4g}'),
+                'spread': [float(f'{quartile:.4g}') for quartile in row['spread']],
+            }
+    path.write_text(json.dumps(list(kept.values()), indent=1) + '\n')
+
+
+def write_document(rows: list[dict[str, Any]], path: Path = DOCUMENT) -> None:
+    """
+    Put the tables of the benchmarks that ran into the document, each between its two markers.
+
+    Raises BenchError where a benchmark has no markers there.
+    """
+    text = path.read_text()
+    for name in dict.fromkeys(row['benchmark'] for row in rows):
+        begin, end = f'<!-- bench {name} -->\n', f'<!-- end {name} -->'
+        head, found, rest = text.partition(begin)
+        _, closed, tail = rest.partition(end)
+        if not (found and closed):
+            raise BenchError(
+                f'{path}: no lines {begin.strip()} and {end} to put the table between'
+            )
+        lines = markdown(table([row for row in rows if row['benchmark'] == name]))
+        text = f'{head}{begin}{lines}{end}{tail}'
+    path.write_text(text)
+
+
+def markdown(cells: list[dict[str, str]]) -> str:
+    """Table of these rows, without the columns in which nobody has anything."""
+    names = [name for name in cells[0] if any(row[name] != '-' for row in cells)]
+    lines = [names, ['---'] * len(names), *([row[name] for name in names] for row in cells)]
+    return ''.join(f'| {" | ".join(line)} |\n' for line in lines)

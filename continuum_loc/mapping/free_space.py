@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.splat_cast import next_cell, start_march
-from continuum_loc.mapping.voxel_index import _find_slot, _pack, AXIS_BITS
+from continuum_loc.mapping.voxel_index import AXIS_BITS, find_slot, pack
 from numba import njit
 import numpy as np
 
@@ -41,8 +41,8 @@ def passes(
 @njit(cache=True)
 def _insert(slots, cells):
     for c in range(cells.shape[0]):
-        key = _pack(cells[c, 0], cells[c, 1], cells[c, 2])
-        row = _find_slot(slots, key, slots.shape[0] - 1)
+        key = pack(cells[c, 0], cells[c, 1], cells[c, 2])
+        row = find_slot(slots, key, slots.shape[0] - 1)
         slots[row, 0], slots[row, 1] = key, c
 
 
@@ -52,8 +52,8 @@ def _count(slots, corner, extent, edge, origins, directions, lengths, counts):
         at, step, until, stride = start_march(origins[ray], directions[ray], corner, edge)
         while until.min() < lengths[ray]:  # the cell ends within the beam
             if 0 <= at[0] < extent[0] and 0 <= at[1] < extent[1] and 0 <= at[2] < extent[2]:
-                key = _pack(at[0], at[1], at[2])
-                row = _find_slot(slots, key, slots.shape[0] - 1)
+                key = pack(at[0], at[1], at[2])
+                row = find_slot(slots, key, slots.shape[0] - 1)
                 if slots[row, 0] == key:
                     counts[slots[row, 1]] += 1
             next_cell(at, step, until, stride)

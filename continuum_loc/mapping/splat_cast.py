@@ -7,7 +7,7 @@ Each map point is taken as a small disc on its tangent plane.
 from __future__ import annotations
 
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import _find_slot, _pack, BLOCK, BLOCK_VOXELS, VoxelIndex
+from continuum_loc.mapping.voxel_index import find_slot, pack, VoxelIndex
 from numba import njit
 import numpy as np
 
@@ -68,15 +68,15 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
     the ray does not run, is not seen: a share of about radius / block edge of the surface has
     thinner cover.
     """
-    edge = arrays.voxel * BLOCK
+    edge = arrays.block
     corner = (arrays.x0, arrays.y0, arrays.z0)
     extent = (arrays.blocks_x, arrays.blocks_y, arrays.blocks_z)
     at, step, until, stride = start_march(origin, direction, corner, edge)
     best, depth, entered = -1, length, 0.0
     while entered <= depth:
         if 0 <= at[0] < extent[0] and 0 <= at[1] < extent[1] and 0 <= at[2] < extent[2]:
-            key = _pack(at[0], at[1], at[2])
-            row = _find_slot(arrays.block_slots, key, arrays.block_slots.shape[0] - 1)
+            key = pack(at[0], at[1], at[2])
+            row = find_slot(arrays.block_slots, key, arrays.block_slots.shape[0] - 1)
             if arrays.block_slots[row, 0] == key:
                 best, depth = _cross_block(
                     arrays,
@@ -131,9 +131,7 @@ def _cross_block(
 ):
     """Improve (row, depth) by the discs of one block."""
     points = arrays.points
-    for p in range(
-        arrays.voxel_start[block * BLOCK_VOXELS], arrays.voxel_start[(block + 1) * BLOCK_VOXELS]
-    ):
+    for p in range(arrays.block_start[block], arrays.block_start[block + 1]):
         row = int(points[p, 3])
         toward = -(
             normals[row, 0] * direction[0]

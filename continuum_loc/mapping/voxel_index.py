@@ -1,20 +1,25 @@
 """
 Exact nearest-neighbour lookup in a point cloud, as arrays that compiled kernels can use.
 
-Two levels. Below, a hashed voxel grid: points lie sorted by voxel, voxels are grouped in blocks of
-4x4x4, and an open-addressing hash table finds a block's points. Above, a cache of candidate lists:
-for a cell of space (the size of a voxel, occupied or not) the few points that can be nearest to
-*some* query inside it. A query then costs one hash probe and a scan of a short list, however far
-it is from the surface and however large the map.
+Two levels. Below, a grid: points lie sorted by block (a cube of some twenty points), and an
+open-addressing hash table finds a block. Above, a cache of candidate lists: for a cell of space (a
+third of a block, occupied or not) the few points that can be nearest to *some* query inside it. A
+query then costs one hash probe and a scan of a short list, however far it is from the surface and
+however large the map.
 
 A point p cannot be nearest anywhere in a box if another point p' is closer at all of it. The
 difference of the two squared distances is linear in the query, so that its minimum over the box
 with centre c and edge h has a closed
 form:  min_q |q-p|^2 - |q-p'|^2 = |c-p|^2 - |c-p'|^2 - h (|g_x| + |g_y| + |g_z|),  g = p' - p.
 
+The nearest point that *faces* a beam has lists of its own, one for each of 24 cones of beam
+directions: they leave out what faces no direction of the cone, and only what faces all of them
+rules others out.
+
 Lists are made when a cell has been visited a few times (until then the grid is searched), in
-memory of fixed size: when it is full it is emptied. Answers never depend on what the cache holds.
-Because queries write to it, use one index (`VoxelIndex.copy`) per thread.
+memory of fixed size: when it is full it is emptied. Answers never depend on what the cache holds:
+of points at the same distance, the first in the caller's order is taken. Because queries write to
+the cache, use one index (`VoxelIndex.copy`) per thread.
 """
 
 from __future__ import annotations
@@ -25,90 +30,94 @@ from continuum_loc.mapping.errors import MapError
 from numba import njit
 import numpy as np
 
-BLOCK = 4  # voxels along a block's edge
-BLOCK_VOXELS = BLOCK**3
-# Mean over occupied voxels; makes lists of about 12, where their length and number balance.
-POINTS_PER_VOXEL = 2.0
-AXIS_BITS = 21
+CELLS_PER_BLOCK = 3.0  # along an edge
+POINTS_PER_CELL = (
+    2.0  # mean over occupied ones; makes lists of about 12, where their length and number balance
+)
+AXIS_BITS = 19
 AXIS_MASK = (1 << AXIS_BITS) - 1
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
-FIRST_REACH = 0.75  # voxels that a search looks around at first
-PATIENCE = 4  # visits to a cell before it gets a list, which costs as much as a dozen searches
+FIRST_REACH = 0.25  # blocks that a search looks around at first
+PATIENCE = 6  # visits to a cell before it gets a list, which costs as much as a dozen searches
 CROWDED = -1000  # entry of a cell whose list would be too long
-ROUNDING = 1e-9  # far above the rounding of coordinates counted in voxels (2^20 of them at most)
-# Rows after the cell table: [cells in use, pool rows in use], [lists made, times emptied].
-COUNTERS = 2
+ROUNDING = 1e-9  # far above the rounding of coordinates counted in blocks
+COUNTERS = (
+    2  # rows after the cell table: [lists kept, pool rows in use], [lists made, times emptied]
+)
+ANY_DIRECTION = 24  # the cone of lists that do not ask for facing
+CONE_COS = 0.85  # of the half-angle of a cone about its axis (0.857 at its farthest corner)
+CONE_SIN = np.sqrt(1.0 - CONE_COS**2)
+CONE_TILT = 0.366  # of the axis of a quarter of a cube's face: (1, tilt, tilt)
 
 
 class VoxelArrays(NamedTuple):
     """
     The index as arrays and scalars.
 
-    Kernels take it whole; only `cell_slots` and `pool` are ever written.
+    Kernels take it whole; only the last five arrays are ever written.
 
-    Kept to few arrays on purpose: handing each one from kernel to kernel costs as much as a tenth
-    of a lookup.
-
-    points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by voxel.
+    points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; normals: (P, 3).
     block_slots: (H, 2) hash table from a block's key to its number.
-    voxel_start: (B * 64 + 1,) first sorted point of each voxel.
-    cell_slots: (C + COUNTERS, 2) hash table from a cell's key to its packed list (start * 2^16 +
-        length), to minus the number of visits so far, or to CROWDED.
-    pool: (L, 4) the lists end to end: rows of `points`.
-    x0, y0, z0: origin [m]; voxel: edge [m]; blocks_x, blocks_y, blocks_z: extent of the map in
-    blocks;
+    block_start: (B + 1,) first sorted point of each block; block_at: (B, 3) its place in blocks.
+    x0, y0, z0: origin [m]; block, cell: edges [m]; blocks_x, blocks_y, blocks_z: extent in blocks;
     reach: distance [m] up to which lists are made.
+    cell_slots: (C + COUNTERS, 2) hash table from a cell's and cone's key to their packed list
+        (start * 2^16 + length), to minus the number of visits so far, or to CROWDED.
+    pool, pool_normals: (L, 4), (L, 3) the lists end to end: rows of `points` and `normals`.
+    scratch: (B,) blocks that a search is about to look at.
+    made_for: (1,) the `min_cos` that facing lists are kept for; another empties the cache.
     """
 
     points: np.ndarray
+    normals: np.ndarray
     block_slots: np.ndarray
-    voxel_start: np.ndarray
-    cell_slots: np.ndarray
-    pool: np.ndarray
+    block_start: np.ndarray
+    block_at: np.ndarray
     x0: float
     y0: float
     z0: float
-    voxel: float
-    inverse_voxel: float
+    block: float
+    inverse_block: float
+    cell: float
+    inverse_cell: float
     blocks_x: int
     blocks_y: int
     blocks_z: int
     reach: float
+    cell_slots: np.ndarray
+    pool: np.ndarray
+    pool_normals: np.ndarray
+    scratch: np.ndarray
+    made_for: np.ndarray
+
+
+# ------------------------------------------------------------ keys and hash tables
 
 
 @njit(cache=True, inline='always')
-def _pack(i, j, k):
+def pack(i, j, k):
+    """Key of a block or cell."""
     return (np.int64(i) << (2 * AXIS_BITS)) | (np.int64(j) << AXIS_BITS) | np.int64(k)
 
 
-@njit(cache=True, inline='always')
-def _hash(key, mask):
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64((mixed ^ (mixed >> np.uint64(32))) & np.uint64(mask))
-
-
 @njit(cache=True)
-def _find_slot(slots, key, mask):
+def find_slot(slots, key, mask):
     """Row of `key` in a table of mask + 1 rows, or of the free row where it belongs."""
-    row = _hash(key, mask)
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    row = np.int64((mixed ^ (mixed >> np.uint64(32))) & np.uint64(mask))
     while slots[row, 0] != key and slots[row, 0] != -1:
         row = (row + 1) & mask
     return row
 
 
-@njit(cache=True, inline='always')
-def _voxel_in_block(i, j, k):
-    """Encode a voxel's place in its block, 0..63, in Morton order (each coordinate 0..3)."""
-    return (
-        ((i & 2) << 4)
-        | ((j & 2) << 3)
-        | ((k & 2) << 2)
-        | ((i & 1) << 2)
-        | ((j & 1) << 1)
-        | (k & 1)
-    )
+@njit(cache=True)
+def _enter(keys, slots):
+    """Put keys (B,) with their numbers into the table."""
+    for number in range(keys.shape[0]):
+        row = find_slot(slots, keys[number], slots.shape[0] - 1)
+        slots[row, 0], slots[row, 1] = keys[number], number
 
 
 @njit(cache=True)
@@ -123,60 +132,71 @@ def _spread_bits(value):
 
 
 @njit(cache=True)
-def _morton_codes(points, origin, inverse_voxel):
-    """
-    (P,) Morton code of each point's voxel.
-
-    The lowest 6 bits number the voxel within its block.
-    """
+def _morton_codes(points, origin, inverse_edge):
+    """(P,) Morton code of each point's cube."""
     codes = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
-        i = np.int64(np.floor((points[p, 0] - origin[0]) * inverse_voxel))
-        j = np.int64(np.floor((points[p, 1] - origin[1]) * inverse_voxel))
-        k = np.int64(np.floor((points[p, 2] - origin[2]) * inverse_voxel))
+        i = np.int64(np.floor((points[p, 0] - origin[0]) * inverse_edge))
+        j = np.int64(np.floor((points[p, 1] - origin[1]) * inverse_edge))
+        k = np.int64(np.floor((points[p, 2] - origin[2]) * inverse_edge))
         codes[p] = (_spread_bits(i) << 2) | (_spread_bits(j) << 1) | _spread_bits(k)
     return codes
 
 
-@njit(cache=True)
-def _fill_blocks(codes, keys, block_slots, voxel_start):
-    """Enter the sorted points' blocks in the hash table; note where each voxel's points start."""
-    block, last, voxel = -1, np.int64(-1), 0
-    for p in range(codes.shape[0]):
-        if codes[p] >> 6 != last:
-            last = codes[p] >> 6
-            block += 1
-            row = _find_slot(block_slots, keys[p], block_slots.shape[0] - 1)
-            block_slots[row, 0], block_slots[row, 1] = keys[p], block
-        here = block * BLOCK_VOXELS + (codes[p] & 63)
-        while voxel <= here:
-            voxel_start[voxel] = p
-            voxel += 1
-    voxel_start[voxel:] = codes.shape[0]
+# ------------------------------------------------------------ the grid
+# u, v, w are x, y, z counted in blocks from the origin. Comparisons that may rule something out
+# give way by ROUNDING, so that rounding never rules a neighbour out.
 
 
 @njit(cache=True, inline='always')
 def _gap2(u, block):
-    """Squared distance, along one axis and in voxels, from a place to a block."""
-    gap = max(block * BLOCK - u, u - (block + 1) * BLOCK, 0.0)
+    """Squared distance, along one axis and in blocks, from a place to a block."""
+    gap = max(block - u, u - block - 1.0, 0.0)
     return gap * gap
 
 
 @njit(cache=True, inline='always')
-def _block_range(u, reach, count):
-    """Half-open range of blocks, of `count`, that u +- reach (in voxels) covers along one axis."""
-    low, high = np.floor((u - reach) / BLOCK), np.floor((u + reach) / BLOCK)
+def _range(u, reach, count):
+    """Half-open range of blocks, of `count`, that u +- reach covers along one axis."""
+    low, high = np.floor(u - reach - ROUNDING), np.floor(u + reach + ROUNDING)
     return int(max(low, 0.0)), int(max(min(high, count - 1.0), -1.0)) + 1
 
 
-@njit(cache=True, inline='always')
-def _voxel_range(u, radius):
-    """
-    Half-open range, within 0..4, of a block's voxels that u +- radius covers.
+@njit(cache=True)
+def _collect(arrays, u, v, w, reach, seen2):
+    """Write the blocks nearer than `reach`, but not than sqrt(seen2), to `scratch`; count them."""
+    slots, scratch, count, reach2 = arrays.block_slots, arrays.scratch, 0, reach * reach
+    i0, i1 = _range(u, reach, arrays.blocks_x)
+    j0, j1 = _range(v, reach, arrays.blocks_y)
+    k0, k1 = _range(w, reach, arrays.blocks_z)
+    if (i1 - i0) * (j1 - j0) * (k1 - k0) > scratch.shape[0]:  # fewer blocks than places for them
+        for number in range(scratch.shape[0]):
+            if seen2 <= _block_gap2(arrays.block_at, number, u, v, w) < reach2:
+                scratch[count] = number
+                count += 1
+        return count
+    for i in range(i0, i1):
+        gap_i = _gap2(u, i)
+        for j in range(j0, j1):
+            gap_ij = gap_i + _gap2(v, j)
+            if gap_ij > reach2:
+                continue
+            for k in range(k0, k1):
+                if not seen2 <= gap_ij + _gap2(w, k) < reach2:
+                    continue
+                key = pack(i, j, k)
+                row = find_slot(slots, key, slots.shape[0] - 1)
+                if slots[row, 0] == key:
+                    scratch[count] = slots[row, 1]
+                    count += 1
+    return count
 
-    u in voxels from the block.
-    """
-    return int(max(np.floor(u - radius), 0.0)), int(min(np.floor(u + radius), BLOCK - 1.0)) + 1
+
+@njit(cache=True, inline='always')
+def _block_gap2(block_at, number, u, v, w):
+    return (
+        _gap2(u, block_at[number, 0]) + _gap2(v, block_at[number, 1])
+    ) + _gap2(w, block_at[number, 2])  # fmt: skip
 
 
 @njit(cache=True, inline='always')
@@ -186,141 +206,104 @@ def _distance2(points, p, x, y, z):
 
 
 @njit(cache=True, inline='always')
-def _faces(normals, p, dx, dy, dz, min_cos):
-    return -(normals[p, 0] * dx + normals[p, 1] * dy + normals[p, 2] * dz) >= min_cos
+def _toward(normals, p, dx, dy, dz):
+    """How far a surface faces a beam: the cosine of the angle of incidence."""
+    return -(normals[p, 0] * dx + normals[p, 1] * dy + normals[p, 2] * dz)
 
 
 @njit(cache=True)
-def _scan_block(
-    points, start, normals, number, u, v, w, radius, x, y, z, dx, dy, dz, min_cos, best, best2
-):
-    """
-    Improve (best sorted point, squared distance) by the points of one block.
-
-    Only in the voxels that the ball touches; u, v, w: the place in voxels from the block's corner.
-    """
-    i0, i1 = _voxel_range(u, radius)
-    j0, j1 = _voxel_range(v, radius)
-    k0, k1 = _voxel_range(w, radius)
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            for k in range(k0, k1):
-                voxel = number * BLOCK_VOXELS + _voxel_in_block(i, j, k)
-                for p in range(start[voxel], start[voxel + 1]):
-                    d2 = _distance2(points, p, x, y, z)
-                    if d2 < best2 and (
-                        min_cos <= -1.0 or _faces(normals, int(points[p, 3]), dx, dy, dz, min_cos)
-                    ):
-                        best, best2 = p, d2
-    return best, best2
+def _scan(points, normals, begin, end, x, y, z, dx, dy, dz, min_cos, best, best2, row):
+    """Improve (place, squared distance, caller's row) by points begin..end that face the beam."""
+    for p in range(begin, end):
+        d2 = _distance2(points, p, x, y, z)
+        if d2 <= best2 and (d2 < best2 or points[p, 3] < row):
+            if min_cos <= -1.0 or _toward(normals, p, dx, dy, dz) >= min_cos:
+                best, best2, row = p, d2, points[p, 3]
+    return best, best2, row
 
 
-# What follows unpacks `arrays` once and counts in voxels from the origin: u, v, w are x, y, z so.
-# Comparisons that may rule something out give way by ROUNDING (relative, and in voxels), so that
-# rounding never rules a neighbour out.
 @njit(cache=True)
-def _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, best2):
+def _search(arrays, x, y, z, dx, dy, dz, min_cos, limit2):
     """
-    (best sorted point or -1, squared distance) of the points nearer than sqrt(best2).
+    Find the nearest that faces the beam: (sorted point or -1, squared distance, caller's row).
 
-    Boxes double until one is sure to hold the nearest. With min_cos = -1 every point counts and
-    `normals` is not read.
+    It is nearer than sqrt(limit2), and looked for in balls that grow until one is sure to hold it.
+    With min_cos = -1 every point counts.
     """
-    points, slots, start, scale = (
+    scale, points, normals, start = (
+        arrays.inverse_block,
         arrays.points,
-        arrays.block_slots,
-        arrays.voxel_start,
-        arrays.inverse_voxel,
+        arrays.normals,
+        arrays.block_start,
     )
     nx, ny, nz = arrays.blocks_x, arrays.blocks_y, arrays.blocks_z
     u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
-    best = -1
-    farthest = BLOCK * (nx + ny + nz) + abs(u) + abs(v) + abs(w)
-    limit = min(np.sqrt(best2) * scale, farthest) * (1.0 + ROUNDING) + ROUNDING
-    to_map = max(-u, u - BLOCK * nx, -v, v - BLOCK * ny, -w, w - BLOCK * nz, 0.0)
-    reach = min(to_map + FIRST_REACH, limit)
+    best, best2, row, seen2 = -1, limit2, -1.0, 0.0
+    farthest = nx + ny + nz + abs(u) + abs(v) + abs(w)
+    limit = min(np.sqrt(limit2) * scale, farthest) * (1.0 + ROUNDING) + ROUNDING
+    reach = min(max(-u, u - nx, -v, v - ny, -w, w - nz, 0.0) + FIRST_REACH, limit)
     while True:
-        i0, i1 = _block_range(u, reach, nx)
-        j0, j1 = _block_range(v, reach, ny)
-        k0, k1 = _block_range(w, reach, nz)
-        if (i1 - i0) * (j1 - j0) * (k1 - k0) > slots.shape[0]:
-            return _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2)
-        radius = min(np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING, reach)
-        for i in range(i0, i1):
-            for j in range(j0, j1):
-                gap_ij = _gap2(u, i) + _gap2(v, j)
-                if gap_ij > radius * radius:
-                    continue
-                for k in range(k0, k1):
-                    if gap_ij + _gap2(w, k) > radius * radius:
-                        continue
-                    key = _pack(i, j, k)
-                    row = _find_slot(slots, key, slots.shape[0] - 1)
-                    if slots[row, 0] == key:
-                        best, best2 = _scan_block(
-                            points,
-                            start,
-                            normals,
-                            slots[row, 1],
-                            u - BLOCK * i,
-                            v - BLOCK * j,
-                            w - BLOCK * k,
-                            radius,
-                            x,
-                            y,
-                            z,
-                            dx,
-                            dy,
-                            dz,
-                            min_cos,
-                            best,
-                            best2,
-                        )
-                        radius = min(np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING, reach)
-        if radius < reach or reach >= limit:
-            return best, best2
-        reach = min(2.0 * reach, limit)
+        radius = limit if best < 0 else np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING
+        for c in range(_collect(arrays, u, v, w, reach, seen2)):
+            number = arrays.scratch[c]
+            if _block_gap2(arrays.block_at, number, u, v, w) > radius * radius:
+                continue
+            best, best2, row = _scan(
+                points, normals, start[number], start[number + 1],
+                x, y, z, dx, dy, dz, min_cos, best, best2, row,
+            )  # fmt: skip
+            radius = min(radius, np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING)
+        if radius <= reach or reach >= limit:
+            return best, best2, row
+        seen2 = reach * reach
+        reach = radius if best >= 0 else min(2.0 * reach, limit)
+
+
+# ------------------------------------------------------------ candidate lists
 
 
 @njit(cache=True)
-def _search_all(arrays, normals, x, y, z, dx, dy, dz, min_cos, best, best2):
-    """
-    Go on with `_search` over the table of blocks.
+def _cone(dx, dy, dz):
+    """Find the cone, 0..23, that holds a direction: a quarter of a face of the cube around it."""
+    x, y, z = abs(dx), abs(dy), abs(dz)
+    if x >= y and x >= z:
+        return ((0 if dx > 0 else 1) << 2) | ((dy > 0) << 1) | (dz > 0)
+    if y >= z:
+        return ((2 if dy > 0 else 3) << 2) | ((dx > 0) << 1) | (dz > 0)
+    return ((4 if dz > 0 else 5) << 2) | ((dx > 0) << 1) | (dy > 0)
 
-    Cheaper than empty space once that is the larger of the two.
+
+@njit(cache=True)
+def _cone_axis(cone):
+    """Return the unit axis of a cone; zero for ANY_DIRECTION."""
+    if cone == ANY_DIRECTION:
+        return 0.0, 0.0, 0.0
+    scale = 1.0 / np.sqrt(1.0 + 2.0 * CONE_TILT * CONE_TILT)
+    face, tilt = cone >> 2, CONE_TILT * scale
+    main = scale if face & 1 == 0 else -scale
+    a = tilt if cone & 2 else -tilt
+    b = tilt if cone & 1 else -tilt
+    if face < 2:
+        return main, a, b
+    if face < 4:
+        return a, main, b
+    return a, b, main
+
+
+@njit(cache=True)
+def _cone_limits(cone, min_cos):
     """
-    points, slots, start, scale = (
-        arrays.points,
-        arrays.block_slots,
-        arrays.voxel_start,
-        arrays.inverse_voxel,
-    )
-    u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
-    for row in range(slots.shape[0]):
-        key = slots[row, 0]
-        i, j, k = key >> (2 * AXIS_BITS), (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
-        radius = np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING
-        if key >= 0 and _gap2(u, i) + _gap2(v, j) + _gap2(w, k) <= radius * radius:
-            best, best2 = _scan_block(
-                points,
-                start,
-                normals,
-                slots[row, 1],
-                u - BLOCK * i,
-                v - BLOCK * j,
-                w - BLOCK * k,
-                radius,
-                x,
-                y,
-                z,
-                dx,
-                dy,
-                dz,
-                min_cos,
-                best,
-                best2,
-            )
-    return best, best2
+    Bounds (may, sure) on the cosine between a surface and the cone's axis.
+
+    From `may` on it may face some direction of the cone, from `sure` on it faces all of them; the
+    latter is 2 where none does.
+    """
+    if cone == ANY_DIRECTION:
+        return -2.0, -1.0
+    sine = np.sqrt(max(1.0 - min_cos * min_cos, 0.0))
+    may = min_cos * CONE_COS - sine * CONE_SIN - ROUNDING
+    sure = min_cos * CONE_COS + sine * CONE_SIN + ROUNDING
+    return (may if min_cos > -CONE_COS else -2.0), (sure if min_cos < CONE_COS else 2.0)
 
 
 @njit(cache=True, inline='always')
@@ -336,131 +319,117 @@ def _never_nearest(points, p, pool, other, x, y, z, edge):
     return p2 - other2 - swing > 1e-12 * (p2 + other2)
 
 
-@njit(cache=True)
-def _gather(arrays, x, y, z, radius, used):
-    """
-    Write to the pool, after row `used`, the points within `radius` that it does not rule out.
+@njit(cache=True, inline='always')
+def _copy(points, normals, p, pool, pool_normals, to):
+    for column in range(4):
+        pool[to, column] = points[p, column]
+    for column in range(3):
+        pool_normals[to, column] = normals[p, column]
 
-    Row `used` itself is among them, so it is written twice and the first one dropped by the
-    caller. Returns the end of what was written, or -1 when there are more than GATHER_LIMIT.
+
+@njit(cache=True)
+def _make_list(arrays, x, y, z, cone, min_cos, begin):
     """
-    points, slots, start, scale = (
-        arrays.points,
-        arrays.block_slots,
-        arrays.voxel_start,
-        arrays.inverse_voxel,
-    )
-    pool, edge, end = arrays.pool, arrays.voxel, used + 1
+    Write the candidates of the cell with this centre from pool row `begin` on.
+
+    Their number (0: no point within reach), or -1 where they are too many.
+    """
+    pool, pool_normals, edge = arrays.pool, arrays.pool_normals, arrays.cell
+    ax, ay, az = _cone_axis(cone)
+    may, sure = _cone_limits(cone, min_cos)
+    half_diagonal = 0.5 * np.sqrt(3.0) * edge * (1.0 + ROUNDING)
+    limit = arrays.reach + half_diagonal
+    best, best2, _ = _search(arrays, x, y, z, ax, ay, az, sure, limit * limit)
+    # Every query of the cell has a point within |c - best| + half diagonal of it.
+    radius = limit if best < 0 else np.sqrt(best2) + 2.0 * half_diagonal
+    if best >= 0:
+        _copy(arrays.points, arrays.normals, best, pool, pool_normals, begin)
+    end = _gather(arrays, x, y, z, radius, ax, ay, az, may, best, begin)
+    if end < 0:
+        return -1
+    end = _prune(pool, pool_normals, begin, end, x, y, z, edge, ax, ay, az, sure)
+    if end - begin > LIST_LIMIT:
+        return -1
+    _sort_rows(pool, pool_normals, begin, end)
+    return end - begin
+
+
+@njit(cache=True)
+def _gather(arrays, x, y, z, radius, ax, ay, az, may, best, begin):
+    """
+    Write to the pool the points within `radius` that may face.
+
+    Not those that `best` (already at row `begin`, or -1) rules out. The end of what was written,
+    or -1 when they are too many.
+    """
+    points, normals, scale = arrays.points, arrays.normals, arrays.inverse_block
+    pool, pool_normals, start = arrays.pool, arrays.pool_normals, arrays.block_start
     u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
+    end = begin if best < 0 else begin + 1
     reach = radius * scale * (1.0 + ROUNDING) + ROUNDING
-    i0, i1 = _block_range(u, reach, arrays.blocks_x)
-    j0, j1 = _block_range(v, reach, arrays.blocks_y)
-    k0, k1 = _block_range(w, reach, arrays.blocks_z)
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            gap_ij = _gap2(u, i) + _gap2(v, j)
-            for k in range(k0, k1):
-                if gap_ij + _gap2(w, k) > reach * reach:
-                    continue
-                key = _pack(i, j, k)
-                row = _find_slot(slots, key, slots.shape[0] - 1)
-                if slots[row, 0] == key:
-                    end = _gather_block(
-                        points,
-                        start,
-                        pool,
-                        slots[row, 1],
-                        u - BLOCK * i,
-                        v - BLOCK * j,
-                        w - BLOCK * k,
-                        reach,
-                        x,
-                        y,
-                        z,
-                        edge,
-                        used,
-                        end,
-                    )
-                    if end < 0:
-                        return end
+    for c in range(_collect(arrays, u, v, w, reach, 0.0)):
+        number = arrays.scratch[c]
+        for p in range(start[number], start[number + 1]):
+            if p == best or _toward(normals, p, ax, ay, az) < may:
+                continue
+            if best >= 0 and _never_nearest(points, p, pool, begin, x, y, z, arrays.cell):
+                continue
+            if _distance2(points, p, x, y, z) > radius * radius * (1.0 + ROUNDING):
+                continue
+            if end - begin >= GATHER_LIMIT:
+                return -1
+            _copy(points, normals, p, pool, pool_normals, end)
+            end += 1
     return end
 
 
 @njit(cache=True)
-def _gather_block(points, start, pool, number, u, v, w, reach, x, y, z, edge, used, end):
-    i0, i1 = _voxel_range(u, reach)
-    j0, j1 = _voxel_range(v, reach)
-    k0, k1 = _voxel_range(w, reach)
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            for k in range(k0, k1):
-                voxel = number * BLOCK_VOXELS + _voxel_in_block(i, j, k)
-                for p in range(start[voxel], start[voxel + 1]):
-                    if _never_nearest(points, p, pool, used, x, y, z, edge):
-                        continue
-                    if end - used > GATHER_LIMIT:
-                        return -1
-                    for column in range(4):
-                        pool[end, column] = points[p, column]
-                    end += 1
-    return end
+def _sort_rows(pool, pool_normals, begin, end):
+    """Bring a list into the caller's order, so that the first of equally near ones wins."""
+    for c in range(begin + 1, end):
+        at = c
+        while at > begin and pool[at - 1, 3] > pool[at, 3]:
+            _swap(pool, pool_normals, at - 1, at)
+            at -= 1
+
+
+@njit(cache=True, inline='always')
+def _swap(pool, pool_normals, a, b):
+    for column in range(4):
+        pool[a, column], pool[b, column] = pool[b, column], pool[a, column]
+    for column in range(3):
+        pool_normals[a, column], pool_normals[b, column] = (
+            pool_normals[b, column],
+            pool_normals[a, column],
+        )
 
 
 @njit(cache=True)
-def _prune(pool, used, end, x, y, z, edge):
-    """
-    Drop from pool rows used..end those ruled out by the one nearest to some corner of the box.
-
-    Returns the new end.
-    """
+def _prune(pool, pool_normals, begin, end, x, y, z, edge, ax, ay, az, sure):
+    """Drop rows ruled out by the sure one that is nearest to a corner of the box; the new end."""
     for corner in range(8):
         qx = x + edge * ((corner & 1) - 0.5)
         qy = y + edge * (((corner >> 1) & 1) - 0.5)
         qz = z + edge * (((corner >> 2) & 1) - 0.5)
-        best, best2 = used, np.inf
-        for c in range(used, end):
-            d2 = _distance2(pool, c, qx, qy, qz)
-            if d2 < best2:
-                best, best2 = c, d2
+        best, best2, _ = _scan(
+            pool, pool_normals, begin, end, qx, qy, qz, ax, ay, az, sure, -1, np.inf, -1.0
+        )
+        if best < 0:
+            return end
         # The winner goes first, where compaction cannot overwrite it before it has been compared
         # with all others.
-        for column in range(4):
-            pool[used, column], pool[best, column] = pool[best, column], pool[used, column]
-        kept = used + 1
-        for c in range(used + 1, end):
-            if not _never_nearest(pool, c, pool, used, x, y, z, edge):
-                for column in range(4):
-                    pool[kept, column] = pool[c, column]
+        _swap(pool, pool_normals, begin, best)
+        kept = begin + 1
+        for c in range(begin + 1, end):
+            if not _never_nearest(pool, c, pool, begin, x, y, z, edge):
+                _copy(pool, pool_normals, c, pool, pool_normals, kept)
                 kept += 1
         end = kept
     return end
 
 
 @njit(cache=True)
-def _make_list(arrays, x, y, z, used):
-    """
-    Write the candidate list of the cell with this centre at pool row `used`.
-
-    Returns its length (0: no point within reach), or -1 where it would be too long.
-    """
-    half_diagonal = 0.5 * np.sqrt(3.0) * arrays.voxel
-    limit = arrays.reach + half_diagonal
-    best, best2 = _search(arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, limit * limit)
-    if best < 0:
-        return 0
-    # Every query of the cell has a point within |c - best| + half diagonal of it.
-    radius = np.sqrt(best2) + 2.0 * half_diagonal * (1.0 + 1e-9)
-    arrays.pool[used] = arrays.points[best]
-    end = _gather(arrays, x, y, z, radius, used)
-    if end < 0:
-        return -1
-    arrays.pool[used] = arrays.pool[end - 1]  # the second copy of `best` is still among them
-    length = _prune(arrays.pool, used, end - 1, x, y, z, arrays.voxel) - used
-    return length if length <= LIST_LIMIT else -1
-
-
-@njit(cache=True)
-def _visit(arrays, key, row):
+def _visit(arrays, key, row, min_cos):
     """
     Count a visit to a cell that has no list, in row `row` of the table.
 
@@ -471,7 +440,7 @@ def _visit(arrays, key, row):
     if slots[row, 0] != key:
         if slots[table, 0] * 2 >= table:
             _empty(slots)
-            row = _find_slot(slots, key, table - 1)
+            row = find_slot(slots, key, table - 1)
         slots[row, 0], slots[row, 1] = key, 0
         slots[table, 0] += 1
     if slots[row, 1] == CROWDED:
@@ -481,7 +450,7 @@ def _visit(arrays, key, row):
         if slots[table, 1] + GATHER_LIMIT + 2 > arrays.pool.shape[0]:
             _empty(slots)
             return np.int64(-1)
-        slots[row, 1] = _add_list(arrays, key)
+        slots[row, 1] = _add_list(arrays, key, min_cos)
     return slots[row, 1]
 
 
@@ -494,38 +463,40 @@ def _empty(slots):
 
 
 @njit(cache=True)
-def _add_list(arrays, key):
-    """Make the list of a cell; its packed entry, or CROWDED."""
-    counters = arrays.cell_slots[-COUNTERS:]
-    x = arrays.x0 + ((key >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * arrays.voxel
-    y = arrays.y0 + (((key >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.voxel
-    z = arrays.z0 + ((key & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.voxel
-    start = counters[0, 1]
-    length = _make_list(arrays, x, y, z, start)
+def _add_list(arrays, key, min_cos):
+    """Make the list of a cell and cone; its packed entry, or CROWDED."""
+    counters, place = arrays.cell_slots[-COUNTERS:], key >> 5
+    x = arrays.x0 + ((place >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * arrays.cell
+    y = arrays.y0 + (((place >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.cell
+    z = arrays.z0 + ((place & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.cell
+    begin = counters[0, 1]
+    length = _make_list(arrays, x, y, z, key & 31, min_cos, begin)
     counters[1, 0] += 1
     if length < 0:
         return np.int64(CROWDED)
     counters[0, 1] += length
-    return (start << 16) + length
+    return (begin << 16) + length
 
 
 @njit(cache=True)
-def _cell_key(x0, y0, z0, inverse_voxel, x, y, z):
-    """Key of the cell that holds a place; -1 for nan and for places absurdly far away."""
-    i = np.floor((x - x0) * inverse_voxel)
-    j = np.floor((y - y0) * inverse_voxel)
-    k = np.floor((z - z0) * inverse_voxel)
+def _list_key(x0, y0, z0, inverse_cell, x, y, z, cone):
+    """Key of the cell that holds a place, with a cone; -1 for nan and places absurdly far away."""
+    i = np.floor((x - x0) * inverse_cell)
+    j = np.floor((y - y0) * inverse_cell)
+    k = np.floor((z - z0) * inverse_cell)
     if not (abs(i) < AXIS_LIMIT and abs(j) < AXIS_LIMIT and abs(k) < AXIS_LIMIT):
         return np.int64(-1)
-    return _pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT)
+    return (pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT) << 5) | cone
+
+
+# ------------------------------------------------------------ lookups
 
 
 @njit(cache=True)
-def _nearest_listed(pool, entry, x, y, z, limit2):
-    """Nearest of a cell's candidates: (pool row or -1, squared distance)."""
+def _nearest_listed(pool, begin, end, x, y, z, limit2):
+    """(pool row or -1, squared distance) of a list's nearest."""
     best, best2 = -1, limit2
-    start = entry >> 16
-    for c in range(start, start + (entry & 0xFFFF)):
+    for c in range(begin, end):
         d2 = _distance2(pool, c, x, y, z)
         if d2 < best2:
             best, best2 = c, d2
@@ -533,143 +504,84 @@ def _nearest_listed(pool, entry, x, y, z, limit2):
 
 
 @njit(cache=True)
-def _nearest_facing_listed(pool, normals, entry, x, y, z, dx, dy, dz, min_cos, limit2):
-    """
-    Nearest of a cell's candidates that face.
-
-    (pool row or -1, squared distance, whether none is nearer).
-    """
-    best, best2, any2 = -1, limit2, limit2
-    start = entry >> 16
-    for c in range(start, start + (entry & 0xFFFF)):
+def _facing_listed(pool, normals, begin, end, x, y, z, dx, dy, dz, min_cos, limit2):
+    """Look, as `_nearest_listed` does, among those that face the beam."""
+    best, best2 = -1, limit2
+    for c in range(begin, end):
         d2 = _distance2(pool, c, x, y, z)
-        if d2 < any2:
-            any2 = d2
-        if d2 < best2 and _faces(normals, int(pool[c, 3]), dx, dy, dz, min_cos):
+        if d2 < best2 and _toward(normals, c, dx, dy, dz) >= min_cos:
             best, best2 = c, d2
-    return best, best2, any2 >= best2
+    return best, best2
 
 
 @njit(cache=True)
-def _nearest_searched(arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2):
-    best, best2 = _search(arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2)
-    if best < 0:
-        return np.int64(-1), np.inf
-    return np.int64(arrays.points[best, 3]), best2
-
-
-@njit(cache=True)
-def nearest(arrays, x, y, z, max_distance):
+def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, index, distance2):
     """
-    (row of the nearest point in the caller's cloud, squared distance [m^2]), or (-1, inf).
+    Find the nearest point to each query (Q, 3); where `facing`, of those that face its direction.
 
-    The latter when none lies strictly within `max_distance` [m] or the query is not finite.
+    `arrays` is unpacked here and not per lookup, which halves the time of one that finds its list.
     """
-    index, distance2 = np.int64(-1), np.inf
-    key = _cell_key(arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel, x, y, z)
-    if key >= 0:
-        slots = arrays.cell_slots
-        row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
-        entry = slots[row, 1]
-        if slots[row, 0] != key or entry < 0:
-            entry = _visit(arrays, key, row)
-        if entry >= 0 and ((entry & 0xFFFF) > 0 or max_distance <= arrays.reach):
-            best, best2 = _nearest_listed(arrays.pool, entry, x, y, z, max_distance * max_distance)
-            if best >= 0:
-                index, distance2 = np.int64(arrays.pool[best, 3]), best2
+    slots, pool, pool_normals, reach = (
+        arrays.cell_slots,
+        arrays.pool,
+        arrays.pool_normals,
+        arrays.reach,
+    )
+    x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_cell
+    mask, limit2 = slots.shape[0] - COUNTERS - 1, max_distance * max_distance
+    dx, dy, dz, cone = 0.0, 0.0, 0.0, ANY_DIRECTION
+    for q in range(queries.shape[0]):
+        index[q], distance2[q] = -1, np.inf
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        if facing:
+            dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
+            cone = _cone(dx, dy, dz)
+        key = _list_key(x0, y0, z0, inverse, x, y, z, cone)
+        if key < 0:
+            continue
+        slot = find_slot(slots, key, mask)
+        entry = slots[slot, 1]
+        if slots[slot, 0] != key or entry < 0:
+            entry = _visit(arrays, key, slot, min_cos)
+        best, best2 = -1, limit2
+        begin, end = entry >> 16, (entry >> 16) + (entry & 0xFFFF)
+        if entry >= 0 and facing:
+            best, best2 = _facing_listed(
+                pool, pool_normals, begin, end, x, y, z, dx, dy, dz, min_cos, limit2
+            )
+        elif entry >= 0:
+            best, best2 = _nearest_listed(pool, begin, end, x, y, z, limit2)
+        # A list knows all that lies within reach, and nothing about what lies beyond.
+        if entry < 0 or (max_distance > reach and (best < 0 or best2 > reach * reach)):
+            best, best2, row = _search(arrays, x, y, z, dx, dy, dz, min_cos, limit2)
         else:
-            index, distance2 = _nearest_searched(
-                arrays, arrays.points, x, y, z, 0.0, 0.0, 0.0, -1.0, max_distance * max_distance
-            )
-    return index, distance2
+            row = pool[best, 3] if best >= 0 else -1.0
+        if best >= 0:
+            index[q], distance2[q] = np.int64(row), best2
 
 
-@njit(cache=True)
-def nearest_facing(arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos):
-    """
-    As `nearest`, among the points whose outward normal n has -(n . d) >= min_cos.
-
-    normals: (P, 3) in the caller's order; d = (dx, dy, dz): unit direction of the ray, so that it
-    hits the surface from its outside. The list holds the nearest of all: where that one faces it
-    is the answer, which is the common case. Otherwise the nearest facing candidate bounds the
-    distance within which the grid is searched.
-    """
-    index, distance2 = np.int64(-1), np.inf
-    key = _cell_key(arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel, x, y, z)
-    if key >= 0:
-        limit2, done = max_distance * max_distance, False
-        slots = arrays.cell_slots
-        row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
-        entry = slots[row, 1]
-        if slots[row, 0] != key or entry < 0:
-            entry = _visit(arrays, key, row)
-        if entry >= 0 and ((entry & 0xFFFF) > 0 or max_distance <= arrays.reach):
-            best, limit2, done = _nearest_facing_listed(
-                arrays.pool, normals, entry, x, y, z, dx, dy, dz, min_cos, limit2
-            )
-            if best >= 0:
-                index, distance2 = np.int64(arrays.pool[best, 3]), limit2
-        if not done:
-            nearer, nearer2 = _nearest_searched(
-                arrays, normals, x, y, z, dx, dy, dz, min_cos, limit2
-            )
-            if nearer >= 0:
-                index, distance2 = nearer, nearer2
-    return index, distance2
-
-
-@njit(cache=True)
-def _stored_list(slots, key):
-    """Return a cell's packed list, or -1 where there is none (yet)."""
-    if key < 0:
-        return np.int64(-1)
-    row = _find_slot(slots, key, slots.shape[0] - COUNTERS - 1)
-    return slots[row, 1] if slots[row, 0] == key else np.int64(-1)
-
-
-# The batches unpack `arrays` once and not per lookup, which halves the time of a lookup that finds
-# its list.
 @njit(cache=True)
 def nearest_batch(arrays, queries, max_distance, index, distance2):
-    """`nearest` for queries (Q, 3), into index (Q,) and distance2 (Q,)."""
-    slots, pool, within = arrays.cell_slots, arrays.pool, max_distance <= arrays.reach
-    x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel
-    for q in range(queries.shape[0]):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        entry = _stored_list(slots, _cell_key(x0, y0, z0, inverse, x, y, z))
-        if entry >= 0 and ((entry & 0xFFFF) > 0 or within):
-            best, best2 = _nearest_listed(pool, entry, x, y, z, max_distance * max_distance)
-            index[q] = np.int64(pool[best, 3]) if best >= 0 else -1
-            distance2[q] = best2 if best >= 0 else np.inf
-        else:
-            index[q], distance2[q] = nearest(arrays, x, y, z, max_distance)
+    """
+    Find the nearest points to queries (Q, 3): their rows index (Q,) and distance2 (Q,) [m^2].
+
+    The rows are the caller's; -1 and inf where none lies strictly within `max_distance` [m] or a
+    query is not finite.
+    """
+    _nearest_batch(arrays, False, queries, queries, max_distance, -1.0, index, distance2)
 
 
 @njit(cache=True)
-def nearest_facing_batch(
-    arrays, normals, queries, directions, max_distance, min_cos, index, distance2
-):
+def nearest_facing_batch(arrays, queries, directions, max_distance, min_cos, index, distance2):
     """
-    `nearest_facing` for queries (Q, 3) along directions (Q, 3).
+    As `nearest_batch`, among the points whose outward normal n has -(n . d) >= min_cos.
 
-    Written into index (Q,) and distance2 (Q,).
+    directions: (Q, 3) unit vectors d along the beams, so that each hits the surface from outside.
     """
-    slots, pool, within = arrays.cell_slots, arrays.pool, max_distance <= arrays.reach
-    x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_voxel
-    for q in range(queries.shape[0]):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
-        entry, done = _stored_list(slots, _cell_key(x0, y0, z0, inverse, x, y, z)), False
-        if entry >= 0 and ((entry & 0xFFFF) > 0 or within):
-            best, best2, done = _nearest_facing_listed(
-                pool, normals, entry, x, y, z, dx, dy, dz, min_cos, max_distance * max_distance
-            )
-            index[q] = np.int64(pool[best, 3]) if best >= 0 else -1
-            distance2[q] = best2 if best >= 0 else np.inf
-        if not done:
-            index[q], distance2[q] = nearest_facing(
-                arrays, normals, x, y, z, dx, dy, dz, max_distance, min_cos
-            )
+    if arrays.made_for[0] != min_cos:
+        _empty(arrays.cell_slots)
+        arrays.made_for[0] = min_cos
+    _nearest_batch(arrays, True, queries, directions, max_distance, min_cos, index, distance2)
 
 
 class VoxelIndex:
@@ -677,39 +589,37 @@ class VoxelIndex:
     Nearest-neighbour index of a fixed cloud; see the module's docstring for how it works.
 
     points: (P, 3) [m], finite, P >= 1. normals: (P, 3) unit, needed for `nearest_facing`.
-    voxel: edge of a voxel [m], by default so that an occupied one holds two points or so.
+    cell: edge of a cell [m], by default so that an occupied one holds two points or so.
     reach: largest distance [m] that is served at full speed; larger ones are exact too, but
     searched for.
-    cache_cells: candidate lists kept at a time (about 0.5 kB each).
+    cache_cells: candidate lists kept at a time (about 1 kB each).
     """
 
     def __init__(
         self,
         points: np.ndarray,
         normals: np.ndarray | None = None,
-        voxel: float | None = None,
+        cell: float | None = None,
         reach: float = 0.1,
         cache_cells: int = 1 << 16,
     ):
         points = _checked_rows(points, 'points')
-        self.normals = points if normals is None else _checked_rows(normals, 'normals')
-        if self.normals.shape != points.shape:
-            raise MapError(f'normals {self.normals.shape} must match points {points.shape}')
+        given = points if normals is None else _checked_rows(normals, 'normals')
+        if given.shape != points.shape:
+            raise MapError(f'normals {given.shape} must match points {points.shape}')
         self._has_normals = normals is not None
-        self.voxel = float(voxel) if voxel is not None else _suitable_voxel(points)
-        if not self.voxel > 0.0 or not reach >= 0.0:
-            raise MapError(
-                f'voxel must be > 0 and reach >= 0, got voxel {voxel!r}, reach {reach!r}'
-            )
+        self.cell = float(cell) if cell is not None else _suitable_cell(points)
+        if not self.cell > 0.0 or not reach >= 0.0:
+            raise MapError(f'cell must be > 0 and reach >= 0, got cell {cell!r}, reach {reach!r}')
         self._cache_cells = int(cache_cells)
-        self.arrays = _build(points, self.voxel, float(reach), self._cache_cells)
+        self.arrays = _build(points, given, self.cell, float(reach), self._cache_cells)
 
     def copy(self) -> VoxelIndex:
         """Return an index of the same cloud with a cache of its own (for another thread)."""
         twin = object.__new__(VoxelIndex)
         twin.__dict__.update(self.__dict__)
-        cell_slots, pool = _empty_cache(self._cache_cells)
-        twin.arrays = self.arrays._replace(cell_slots=cell_slots, pool=pool)
+        blocks = len(self.arrays.block_at)
+        twin.arrays = self.arrays._replace(**_empty_cache(self._cache_cells, blocks))
         return twin
 
     def reserve(self) -> VoxelIndex:
@@ -735,7 +645,8 @@ class VoxelIndex:
         """
         Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3).
 
-        -1 and inf where none.
+        They are -1 and inf where none is nearer than max_distance [m]. Of equally near points the
+        first is taken.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
         index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
@@ -763,7 +674,6 @@ class VoxelIndex:
         index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
         nearest_facing_batch(
             self.arrays,
-            self.normals,
             queries,
             directions,
             float(max_distance),
@@ -786,68 +696,79 @@ def _checked_rows(rows: np.ndarray, name: str) -> np.ndarray:
     return rows
 
 
-def _suitable_voxel(points: np.ndarray) -> float:
-    """Voxel edge at which occupied voxels hold about POINTS_PER_VOXEL points of a surface."""
+def _suitable_cell(points: np.ndarray) -> float:
+    """Edge at which occupied cells hold about POINTS_PER_CELL points, for points on a surface."""
     extent = float(np.ptp(points, axis=0).max())
     if extent == 0.0:
         return 1.0
     origin = points.min(axis=0)
     smallest = extent / (AXIS_LIMIT // 2)
-    voxel = max(extent * np.sqrt(POINTS_PER_VOXEL / len(points)), smallest)
+    cell = max(extent * np.sqrt(POINTS_PER_CELL / len(points)), smallest)
     for _ in range(4):  # occupancy grows as the square of the edge
         occupied = 1 + np.count_nonzero(
-            np.diff(np.sort(_morton_codes(points, origin, 1.0 / voxel)))
+            np.diff(np.sort(_morton_codes(points, origin, 1.0 / cell)))
         )
-        voxel = max(voxel * np.sqrt(POINTS_PER_VOXEL * occupied / len(points)), smallest)
-        if voxel >= extent:
+        cell = max(cell * np.sqrt(POINTS_PER_CELL * occupied / len(points)), smallest)
+        if cell >= extent:
             return extent
-    return voxel
+    return cell
 
 
-def _build(points: np.ndarray, voxel: float, reach: float, cache_cells: int) -> VoxelArrays:
-    origin, inverse = points.min(axis=0), 1.0 / voxel
-    extent = np.floor((points.max(axis=0) - origin) * inverse).astype(np.int64)
-    if extent.max() >= AXIS_LIMIT:
+def _build(
+    points: np.ndarray, normals: np.ndarray, cell: float, reach: float, cache_cells: int
+) -> VoxelArrays:
+    origin, block = points.min(axis=0), CELLS_PER_BLOCK * cell
+    if np.floor((points.max(axis=0) - origin) / cell).max() >= AXIS_LIMIT:
         raise MapError(
-            f'voxel {voxel} m is too small for a cloud {np.ptp(points, axis=0).max():.6g} m '
-            f'across; at most {AXIS_LIMIT} voxels fit along an axis'
+            f'cell {cell} m is too small for a cloud {np.ptp(points, axis=0).max():.6g} m across; '
+            f'at most {AXIS_LIMIT} cells fit along an axis'
         )
-    codes = _morton_codes(points, origin, inverse)
+    codes = _morton_codes(points, origin, 1.0 / block)
     order = np.argsort(codes, kind='stable')
-    codes, points = codes[order], np.column_stack([points[order], order.astype(np.float64)])
-    block = np.floor((points[:, :3] - origin) * inverse).astype(np.int64) // BLOCK
-    keys = (block[:, 0] << (2 * AXIS_BITS)) | (block[:, 1] << AXIS_BITS) | block[:, 2]
-    count = 1 + int(np.count_nonzero(np.diff(codes >> 6)))
-    block_slots = np.full((_power_of_two(4 * count), 2), -1, np.int64)
-    voxel_start = np.empty(count * BLOCK_VOXELS + 1, np.int64)
-    _fill_blocks(codes, keys, block_slots, voxel_start)
+    first = np.flatnonzero(np.diff(codes[order], prepend=-1))
+    at = np.floor((points[order[first]] - origin) * (1.0 / block))
+    slots = np.full((_power_of_two(4 * len(first)), 2), -1, np.int64)
+    _enter(np.array([pack(*place) for place in at.astype(np.int64).tolist()]), slots)
     return VoxelArrays(
-        points,
-        block_slots,
-        voxel_start,
-        *_empty_cache(cache_cells),
-        *map(float, origin),
-        voxel,
-        inverse,
-        *map(int, extent // BLOCK + 1),
-        reach,
+        points=np.column_stack([points[order], order.astype(np.float64)]),
+        normals=normals[order],
+        block_slots=slots,
+        block_start=np.append(first, len(points)),
+        block_at=at,
+        **dict(zip(('x0', 'y0', 'z0'), map(float, origin), strict=True)),
+        block=block,
+        inverse_block=1.0 / block,
+        cell=cell,
+        inverse_cell=1.0 / cell,
+        **dict(
+            zip(
+                ('blocks_x', 'blocks_y', 'blocks_z'),
+                map(int, at.max(axis=0) + 1),
+                strict=True,
+            )
+        ),
+        reach=reach,
+        **_empty_cache(cache_cells, len(first)),
     )
 
 
-def _empty_cache(cells: int) -> tuple[np.ndarray, np.ndarray]:
+def _empty_cache(cells: int, blocks: int) -> dict[str, np.ndarray]:
     """Tables for that many candidate lists; the memory of the pool is taken only as it fills."""
     cell_slots = np.full((_power_of_two(2 * cells) + COUNTERS, 2), -1, np.int64)
     cell_slots[-COUNTERS:] = 0
-    return cell_slots, np.empty((20 * cells + 2 * GATHER_LIMIT, 4))
+    rows = 20 * cells + 2 * GATHER_LIMIT
+    return {
+        'cell_slots': cell_slots,
+        'pool': np.empty((rows, 4)),
+        'pool_normals': np.empty((rows, 3)),
+        'scratch': np.empty(blocks, np.int64),
+        'made_for': np.full(1, np.nan),
+    }
 
 
-def spatial_order(points: np.ndarray, voxel: float) -> np.ndarray:
-    """
-    (P,) rows of the points along a Morton curve through voxels of this edge [m].
-
-    Neighbours lie close in memory.
-    """
-    return np.argsort(_morton_codes(points, points.min(axis=0), 1.0 / voxel), kind='stable')
+def spatial_order(points: np.ndarray, edge: float) -> np.ndarray:
+    """Rows (P,) of the points along a Morton curve through cubes of this edge [m]."""
+    return np.argsort(_morton_codes(points, points.min(axis=0), 1.0 / edge), kind='stable')
 
 
 def _power_of_two(least: int) -> int:

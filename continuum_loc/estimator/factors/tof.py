@@ -314,7 +314,7 @@ def _add(
             T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work
         )
         if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
-            associate(T, q[f], rays[f], variance[f], arrays, normals, gate, min_cosine, hits[f])
+            associate(T, q[f], rays[f], variance[f], arrays, gate, min_cosine, hits[f])
             poses[f] = T
             poses[f, 3, 3] = gate
         frame_cost, frame_squared, frame_count = frame_information(
@@ -411,7 +411,7 @@ def _add_clocks(
 
 
 @njit(cache=True)
-def associate(T, q, rays, variance, arrays, normals, gate, min_cosine, hits):
+def associate(T, q, rays, variance, arrays, gate, min_cosine, hits):
     """
     Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body.
 
@@ -428,7 +428,7 @@ def associate(T, q, rays, variance, arrays, normals, gate, min_cosine, hits):
                 else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
             )
             directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
-    nearest_facing_batch(arrays, normals, points, directions, gate, min_cosine, hits, distance2)
+    nearest_facing_batch(arrays, points, directions, gate, min_cosine, hits, distance2)
 
 
 @njit(cache=True)

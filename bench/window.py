@@ -1,0 +1,343 @@
+"""
+Least squares over a window, beside gtsam.
+
+`run(quick)` gives rows on one core, alternating the two; both sides give the same answer, which is
+checked:
+- *window, solve*: the engine robot's window of 1 s after 3 s of data (16 ToF x 64 zones, gyros,
+  strain; all its factors and priors, linearised): from its normal equations to all offsets.
+  gtsam is handed them as HessianFactors, made beforehand, in the order of time, once with a column
+  of the window as one variable and once with a variable per node, in which it may find what is
+  sparse; the faster of the two is its row.
+- *window, solve and covariance*: and the covariance of the newest column.
+- *temporal chain, Gauss-Newton*: one rigid body in the place of the robot, the motion prior
+  between 6 knots and 240 frames at times between them, each a 6x6 information of the body's pose:
+  four iterations from a poor guess. gtsam's package has neither this prior nor the interpolation,
+  so that they enter as CustomFactors which call the very kernels that ours does: what this row
+  compares is everything around them, gtsam's calls of Python included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from continuum_loc import lie, lie_kernels
+from continuum_loc.estimator import gp
+from continuum_loc.estimator.chain import Blocks, Chain, Message
+from continuum_loc.estimator.settings import load_estimator_settings
+from continuum_loc.estimator.state import NODE_DIM
+from continuum_loc.evaluation.bench import one_core, seconds_of, side_by_side
+from continuum_loc.evaluation.trials import make_filter, scene_map, simulate, Trial
+from continuum_loc.measurements import TruthSample
+from continuum_loc.robot import load_robot
+from numba import njit
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+AGREEMENT = 1e-6  # relative, of the offsets; and of the chain's poses [m, rad]
+KNOTS, FRAMES, ITERATIONS = 6, 240, 4
+BODY = 12  # pose and velocity
+SPREAD = np.array([0.02, 0.02, 0.02, 0.05, 0.05, 0.05])  # how far the poor guess is off [m, rad]
+
+
+def run(quick: bool = False) -> list[dict]:
+    """Rows of name, ours_s, peer, peer_s (seconds), ratio and spread."""
+    repeats = 5 if quick else 25
+    with one_core(), threadpool_limits(1):
+        return [*_window_rows(repeats), _temporal_row(repeats)]
+
+
+# ------------------------------------------------------------ the linear window
+
+
+def _window_rows(repeats: int) -> list[dict]:
+    start, blocks, nodes = _engine_window()
+    dim, last = len(start.gradient), len(blocks)
+    newest = np.eye(dim, order='F')
+
+    def solve() -> list[np.ndarray]:
+        return Chain(dim, start).solve(blocks, 0)
+
+    def solve_and_covariance() -> tuple[np.ndarray, np.ndarray]:
+        chain = Chain(dim, start)
+        return chain.solve(blocks, 0)[-1], chain.covariance(last, newest)
+
+    candidates = [_Gtsam(start, blocks, split) for split in ([0, dim], _per_node(nodes, dim))]
+    for candidate in candidates:
+        _require_close(candidate.solve(), np.concatenate(solve()), 'solution')
+        _require_close(
+            candidate.solve_and_covariance()[1], solve_and_covariance()[1], 'covariance'
+        )
+    peer = min(candidates, key=lambda one: seconds_of(one.solve, 5))
+    return [
+        side_by_side('window, solve', solve, 'gtsam', peer.optimise, repeats),
+        side_by_side(
+            'window, solve and covariance',
+            solve_and_covariance,
+            'gtsam',
+            candidates[0].solve_and_covariance,
+            repeats,
+        ),
+    ]
+
+
+def _engine_window() -> tuple[Message, list[Blocks], int]:
+    """Start message and normal equations of the engine robot's window; its number of nodes."""
+    settings = load_estimator_settings('engine')
+    estimator = make_filter(load_robot('engine'), scene_map('S0'), settings)
+    for sample in simulate(Trial('engine', 'S0', 't2', duration=3.0)):
+        if not isinstance(sample, TruthSample):
+            estimator.process(sample)
+    window = estimator.window
+    return (
+        window.chain.messages[0],
+        [interval.blocks for interval in window.intervals],
+        estimator.grid.nodes,
+    )
+
+
+def _per_node(nodes: int, dim: int) -> list[int]:
+    """Bounds of the variables of a column: one per node, and its biases."""
+    return [*range(0, NODE_DIM * nodes + 1, NODE_DIM), dim]
+
+
+class _Gtsam:
+    """The same quadratic as HessianFactors, each column split into variables at `bounds`."""
+
+    def __init__(self, start: Message, blocks: list[Blocks], bounds: list[int]):
+        import gtsam
+
+        self._gtsam = gtsam
+        self._per_column = len(bounds) - 1
+        self._graph = gtsam.GaussianFactorGraph()
+        self._columns = len(blocks) + 1
+        pieces = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        self._add(start.information, start.gradient, 0, pieces)
+        for k, block in enumerate(blocks):
+            dim = bounds[-1]
+            both = pieces + [slice(piece.start + dim, piece.stop + dim) for piece in pieces]
+            self._add(block.H, block.g, k * self._per_column, both)
+        self._order = gtsam.Ordering()
+        for key in range(self._columns * self._per_column):
+            self._order.push_back(key)
+
+    def _add(self, H: np.ndarray, g: np.ndarray, first: int, pieces: list[slice]) -> None:
+        """Add a quadratic; gtsam minimises 1/2 x^T G x - x^T g."""
+        make, H = self._gtsam.HessianFactor, np.asarray(H)
+        if len(pieces) == 2:  # whole columns: the natural factor of an interval
+            a, b = pieces
+            self._graph.push_back(
+                make(first, first + 1, H[a, a], H[a, b], -g[a], H[b, b], -g[b], 0.0)
+            )
+            return
+        for i, a in enumerate(pieces):
+            self._graph.push_back(make(first + i, H[a, a], -g[a], 0.0))
+            for j, b in enumerate(pieces[:i]):
+                if np.any(H[b, a]):
+                    zero_b, zero_a = np.zeros_like(H[b, b]), np.zeros_like(H[a, a])
+                    self._graph.push_back(
+                        make(
+                            first + j,
+                            first + i,
+                            zero_b,
+                            H[b, a],
+                            zero_b[0],
+                            zero_a,
+                            zero_a[0],
+                            0.0,
+                        )
+                    )
+
+    def optimise(self):
+        return self._graph.optimize(self._order)
+
+    def solve(self) -> np.ndarray:
+        """All offsets, end to end."""
+        values = self.optimise()
+        return np.concatenate([values.at(key) for key in range(self._columns * self._per_column)])
+
+    def solve_and_covariance(self) -> tuple[object, np.ndarray]:
+        """Solve; the solution and the newest column's covariance."""
+        tree = self._graph.eliminateMultifrontal(self._order)
+        last = self._columns - 1
+        if self._per_column > 1:
+            return tree.optimize(), self._joint(tree)
+        return tree.optimize(), tree.marginalCovariance(last)
+
+    def _joint(self, tree) -> np.ndarray:
+        n = self._per_column
+        keys = list(range((self._columns - 1) * n, self._columns * n))
+        return np.linalg.inv(self._graph.marginal(keys).hessian()[0])
+
+
+def _require_close(theirs: np.ndarray, ours: np.ndarray, what: str) -> None:
+    off = np.abs(theirs - ours).max() / np.abs(ours).max()
+    if not off < AGREEMENT:
+        raise RuntimeError(
+            f'gtsam and we disagree on the {what} by {off:.1e} of its largest entry'
+        )
+
+
+# ------------------------------------------------------------ the temporal chain, not linear
+
+
+def _temporal_row(repeats: int) -> dict:
+    times, measured, information, guess, period = _temporal_problem()
+    psd = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    ours = lambda: _gauss_newton(times, measured, information, guess, period, psd)  # noqa: E731
+    theirs = _gtsam_chain(times, measured, information, guess, period, psd)
+    gap = np.abs(ours() - theirs()).max()
+    if not gap < AGREEMENT:
+        raise RuntimeError(f'the two chains end {gap:.1e} apart')
+    return side_by_side(
+        f'temporal chain, {ITERATIONS} Gauss-Newton iterations',
+        ours,
+        'gtsam, CustomFactor',
+        theirs,
+        max(repeats // 3, 3),
+    )
+
+
+def _temporal_problem():
+    """Make up times, poses (F, 4, 4) and informations (F, 6, 6) of frames; guess; period [s]."""
+    rng = np.random.default_rng(0)
+    period = 1.0 / (KNOTS - 1)
+    times = np.sort(rng.uniform(0.0, 1.0, FRAMES)).clip(1e-3, 1.0 - 1e-3)
+    twist = np.array([0.1, 0.02, -0.05, 0.3, -0.2, 0.1])
+    measured = lie.exp(times[:, None] * twist) @ lie.exp(1e-3 * rng.normal(size=(FRAMES, 6)))
+    directions = rng.normal(size=(FRAMES, 64, 6))
+    information = 1e3 * np.einsum('fzi,fzj->fij', directions, directions)
+    knots = np.arange(KNOTS)[:, None] * period
+    guess = lie.exp(knots * twist) @ lie.exp(SPREAD * rng.normal(size=(KNOTS, 6)))
+    return times, measured, information, guess, period
+
+
+def _gauss_newton(times, measured, information, guess, period, psd) -> np.ndarray:
+    """Knot poses (K, 4, 4) after ITERATIONS, by the estimator's kernels and its chain."""
+    T, v = guess.copy(), np.zeros((KNOTS, 6))
+    start_T = guess[0].copy()
+    knot = np.minimum((times / period).astype(np.int64), KNOTS - 2)
+    H, g = np.empty((KNOTS - 1, 2 * BODY, 2 * BODY)), np.empty((KNOTS - 1, 2 * BODY))
+    for _ in range(ITERATIONS):
+        _linearise(T, v, times - knot * period, knot, measured, information, period, 1 / psd, H, g)
+        e = lie.log(lie.inverse(start_T) @ T[0])
+        J = lie.right_jacobian_inverse(e)
+        first = Message(np.eye(BODY), np.concatenate([J.T @ e, v[0]]))
+        first.information[:6, :6] = J.T @ J
+        chain = Chain(BODY, first)
+        offsets = np.array(chain.solve([Blocks(h, b) for h, b in zip(H, g, strict=True)], 0))
+        T, v = T @ lie.exp(offsets[:, :6]), v + offsets[:, 6:]
+    return T
+
+
+@njit(cache=True)
+def _linearise(T, v, tau, knot, measured, information, period, q_inverse, H, g):
+    W, V, M = lie_kernels.workspace()
+    J_work, index, work = np.empty((2, 6, 24)), np.arange(24), np.empty((6, 24))
+    e, J = np.empty(12), np.empty((12, 24))
+    T_now, v_now = np.empty((4, 4)), np.empty(6)
+    J_pose, J_rate = np.empty((6, 24)), np.empty((6, 24))
+    H_body, g_body = np.empty((6, 6)), np.empty(6)
+    residual, J_log = np.empty(6), np.empty((6, 6))
+    H[:] = 0.0
+    g[:] = 0.0
+    for k in range(H.shape[0]):
+        gp.motion_error(T[k], v[k], T[k + 1], v[k + 1], period, e, J, W, V, M)
+        gp.add_motion(H[k], g[k], index, e, J, period, q_inverse)
+    for f in range(tau.shape[0]):
+        k = knot[f]
+        gp.hermite(
+            T[k], v[k], T[k + 1], v[k + 1], period, tau[f],
+            T_now, v_now, J_pose, J_rate, W, V, M, J_work,
+        )  # fmt: skip
+        _pose_error(measured[f], T_now, residual, J_log, W, V, M)
+        weighted = J_log.T @ information[f]
+        H_body[:] = weighted @ J_log
+        g_body[:] = weighted @ residual
+        gp.add_local(H[k], g[k], index, H_body, g_body, J_pose, work)
+
+
+@njit(cache=True)
+def _pose_error(measured, T, residual, J, W, V, M):
+    """Residual (6,) = Log(measured^-1 T) and its Jacobian by a right perturbation of T."""
+    lie_kernels.relative(measured, T, M[0])
+    lie_kernels.log(M[0], residual)
+    lie_kernels.ad(residual, W[0])
+    lie_kernels.right_inverse_coefficients(residual, V[1], V[2])
+    lie_kernels.polynomial(V[1], W[0], J, W[1])
+
+
+def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[], np.ndarray]:
+    """Pose the same problem to gtsam, whose Pose3 perturbs [rotation; translation]."""
+    import gtsam
+
+    swap = np.array([3, 4, 5, 0, 1, 2])
+    pose, rate = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V
+    W, V, M = lie_kernels.workspace()
+    J_work, e, J = np.empty((2, 6, 24)), np.empty(12), np.empty((12, 24))
+    T_now, v_now = np.empty((4, 4)), np.empty(6)
+    J_pose, J_rate = np.empty((6, 24)), np.empty((6, 24))
+    residual, J_log = np.empty(6), np.empty((6, 6))
+
+    def state(values, k: int):
+        return values.atPose3(pose(k)).matrix(), values.atVector(rate(k))
+
+    def share(J_all: np.ndarray, jacobians) -> None:
+        """By [pose, rate] of two knots, in gtsam's order of a pose's tangent."""
+        jacobians[0], jacobians[1] = J_all[:, swap], J_all[:, 6:12]
+        jacobians[2], jacobians[3] = J_all[:, 12:18][:, swap], J_all[:, 18:]
+
+    def motion(k: int):
+        def error(_, values, jacobians):
+            gp.motion_error(*state(values, k), *state(values, k + 1), period, e, J, W, V, M)
+            if jacobians is not None:
+                share(J, jacobians)
+            return e.copy()
+
+        return error
+
+    def frame(f: int, k: int, tau: float):
+        def error(_, values, jacobians):
+            gp.hermite(
+                *state(values, k), *state(values, k + 1), period, tau,
+                T_now, v_now, J_pose, J_rate, W, V, M, J_work,
+            )  # fmt: skip
+            _pose_error(measured[f], T_now, residual, J_log, W, V, M)
+            if jacobians is not None:
+                share(J_log @ J_pose, jacobians)
+            return residual.copy()
+
+        return error
+
+    def keys(k: int) -> list[int]:
+        return [pose(k), rate(k), pose(k + 1), rate(k + 1)]
+
+    graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    per_rate = np.array([[12 / period**3, -6 / period**2], [-6 / period**2, 4 / period]])
+    model = gtsam.noiseModel.Gaussian.Information(np.kron(per_rate, np.diag(1 / psd)))
+    for k in range(KNOTS):
+        initial.insert(pose(k), gtsam.Pose3(guess[k]))
+        initial.insert(rate(k), np.zeros(6))
+        if k < KNOTS - 1:
+            graph.add(gtsam.CustomFactor(model, keys(k), motion(k)))
+    unit = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)
+    graph.add(gtsam.PriorFactorPose3(pose(0), gtsam.Pose3(guess[0]), unit))
+    graph.add(gtsam.PriorFactorVector(rate(0), np.zeros(6), unit))
+    for f, time in enumerate(times):
+        k = min(int(time / period), KNOTS - 2)
+        model = gtsam.noiseModel.Gaussian.Information(information[f])
+        graph.add(gtsam.CustomFactor(model, keys(k), frame(f, k, time - k * period)))
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setMaxIterations(ITERATIONS)
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(0.0)
+
+    def solve() -> np.ndarray:
+        found = gtsam.GaussNewtonOptimizer(graph, initial, parameters).optimize()
+        return np.array([found.atPose3(pose(k)).matrix() for k in range(KNOTS)])
+
+    return solve
+
+
+if __name__ == '__main__':
+    for row in run():
+        print(row)
