@@ -65,13 +65,21 @@ class Health:
         """Note that a sensor gave a usable sample at `time` [s]."""
         self._heard[sensor] = max(time, self._heard.get(sensor, time))
 
-    def look(self, time: float, body_believed: bool) -> None:
-        """Judge every sensor; `body_believed` says that a search found no better body."""
+    def look(self, time: float, body_believed: bool, body_doubted: bool) -> None:
+        """
+        Judge every sensor.
+
+        body_believed: a search found no better body. body_doubted: it may be in a wrong place,
+        where clocks that are right do not fit either.
+        """
         reasons = dict.fromkeys(self._noisy(), NOISY)
         for name in self._misfits():
             if body_believed or name in self.disbelieved or name not in self._tof_names:
                 reasons[name] = 'does not fit'
-        self._look_at_clocks(time)
+        if not body_doubted:
+            self._look_at_clocks(time)
+        elif time - self._clocks_known > KNOWN_FOR:
+            self._late = {}
         for clock in self._late.values():
             reasons.update(dict.fromkeys(clock.sensors, _lateness(clock)))
         reasons.update(dict.fromkeys(self._silent(time), 'silent'))

@@ -34,6 +34,7 @@ COARSE_SPACING = 0.04
 ZONE_STRIDE = 3  # zones are smooth over their neighbours: a third of them tells hypotheses apart
 SEARCH_INTERVALS = 2  # the newest, whose measurements decide between bodies
 GATE_SHRINK = 0.75  # of the gate of association, at each iteration from a guess
+SHARE_SLACK = 0.02  # of fitting zones, by which two bodies explain about as much
 AMBIGUOUS = 0.03  # [m] bodies closer than this at every ring are the same one
 BACKOFF_LIMIT = 8.0  # [s] longest time between two searches of a body that stays suspect
 
@@ -148,7 +149,7 @@ class Recovery:
 
     def look_after(self, time: float, converged: bool) -> None:
         """Notice a wrong minimum by the worst ring's fitting share, and look for a better body."""
-        self._health.look(time, body_believed=False)
+        self._health.look(time, body_believed=False, body_doubted=self._watch.since is not None)
         if self._tof is None or not self._settings.enabled:
             self.acquired = self.acquired or converged
             return
@@ -160,7 +161,7 @@ class Recovery:
             confirmed = self._search()
             self._watch.searched(time, confirmed)
             if confirmed:
-                self._health.look(time, body_believed=True)
+                self._health.look(time, body_believed=True, body_doubted=True)
         self._doubt = self._how_doubtful(self._worst_share())
 
     def _narrow(self, iteration: int) -> bool:
@@ -204,39 +205,76 @@ class Recovery:
 
         True when the body that results is to be believed: no other one fits as well.
         """
-        window, rings = self._window, self._window.grid.ring_nodes
+        window = self._window
         rows = window.newest_rows(self._tof, SEARCH_INTERVALS)
         if not rows:
             return False
+        past = window.snapshot() if self.acquired else None
         window.keep_newest(SEARCH_INTERVALS)
         present = window.columns[-1]
-        tries = [self._refine()]
+        mine = self._refine()
+        tries = [mine]
         for strain in self._shapes.find(present.T[0], Snapshot.of(rows)):
             window.place(place(window.grid, present, present.T[0], strain))
             tries.append(self._refine())
-        margin = 1.0 + self._settings.margin
-        best = min(tries[1:], key=lambda one: one[0])
-        chosen = best if best[0] * margin < tries[0][0] else tries[0]
-        window.set_columns(chosen[1])
-        self._refine()
+        chosen = min((one for one in tries if self._beats(one, mine)), key=_cost, default=mine)
+        if past is not None and chosen is mine:
+            window.restore(past)  # nothing better was found: what was known before still is
+        else:
+            window.set_columns(chosen.columns)
+            self._refine()
         self.acquired = True
-        gaps = [
-            np.linalg.norm(
-                columns[-1].T[rings, :3, 3] - chosen[1][-1].T[rings, :3, 3], axis=1
-            ).max()
-            for _, columns in tries
-        ]
-        return all(
-            gap < AMBIGUOUS or cost > chosen[0] * margin
-            for (cost, _), gap in zip(tries, gaps, strict=True)
+        return not any(self._rivals(one, chosen) for one in tries)
+
+    def _beats(self, other: Try, mine: Try) -> bool:
+        """
+        Whether another body is better: it costs clearly less, and more fits it.
+
+        Cost alone misleads where the map lacks something: zones without a match near the right
+        body cost more than zones that lie a little off in a wrong one, where no sensor fits
+        wholly.
+        """
+        cheaper = other.cost * (1.0 + self._settings.margin) < mine.cost
+        return cheaper and other.share > mine.share and other.whole >= mine.whole
+
+    def _rivals(self, other: Try, chosen: Try) -> bool:
+        """Whether another body, somewhere else, explains about as much."""
+        rings = self._window.grid.ring_nodes
+        here, there = (one.columns[-1].T[rings, :3, 3] for one in (chosen, other))
+        return (
+            np.linalg.norm(here - there, axis=1).max() >= AMBIGUOUS
+            and other.cost <= chosen.cost * (1.0 + self._settings.margin)
+            and other.share > chosen.share - SHARE_SLACK
+            and other.whole >= chosen.whole
         )
 
-    def _refine(self) -> tuple[float, list[Column]]:
-        """Solve the window from where it is: (cost of its measurements, its columns)."""
+    def _refine(self) -> Try:
+        """Solve the window from where it is."""
         self.acquire()
-        return self._window.measurement_cost(), [
-            self._window.column(k) for k in range(len(self._window.columns))
-        ]
+        columns = [self._window.column(k) for k in range(len(self._window.columns))]
+        shares = self._window.fit().shares
+        tof = np.array([shares[name] for name in self._tof.weights if name in shares])
+        whole = int(np.sum(tof >= self._settings.suspect_share))
+        return Try(self._window.measurement_cost(), float(np.mean(tof)), whole, columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Try:
+    """
+    A body that was tried.
+
+    Cost of its measurements, mean share of zones that fit, number of sensors of which (nearly)
+    all do, its columns.
+    """
+
+    cost: float
+    share: float
+    whole: int
+    columns: list[Column]
+
+
+def _cost(one: Try) -> float:
+    return one.cost
 
 
 class ShapeSearch:

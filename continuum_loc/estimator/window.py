@@ -43,6 +43,18 @@ class Fit:
     shares: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """A window's content at one time; `chain` holds what was marginalised."""
+
+    columns: list[Column]
+    offsets: list[np.ndarray]
+    intervals: list[Interval]
+    chain: Chain
+    pinned: bool
+    moving: bool
+
+
 class Window:
     """Columns, offsets and intervals, and the optimisation over them."""
 
@@ -113,6 +125,25 @@ class Window:
         self.columns = list(columns)
         self.offsets = [np.zeros(self.grid.dim) for _ in columns]
         self.forget_past(moving=True)
+
+    def snapshot(self) -> Kept:
+        """Keep what the window knows, for `restore`."""
+        return Kept(
+            list(self.columns),
+            list(self.offsets),
+            list(self.intervals),
+            self.chain,
+            self.pinned,
+            self._moving,
+        )
+
+    def restore(self, kept: Kept) -> None:
+        """Go back to a snapshot and solve again: intervals were linearised elsewhere since."""
+        self.columns, self.offsets = list(kept.columns), list(kept.offsets)
+        self.intervals, self.chain = list(kept.intervals), kept.chain
+        self.pinned, self._moving = kept.pinned, kept.moving
+        self.mark_changed()
+        self.track()
 
     def place(self, shape: Column) -> None:
         """Put the whole window motionless into one shape and forget the past."""
