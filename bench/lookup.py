@@ -273,7 +273,7 @@ def _compare_facing(prior, index, peer, query, batches, repeats) -> list[dict]:
 
 
 def _compare_any(prior: PriorMap, beams: np.ndarray, ours: Query, batches: list[np.ndarray]):
-    """SciPy's tree asked for several neighbours, and the share of our answers that it finds."""
+    """Ask SciPy's tree for several neighbours, and the share of our answers that it finds."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(prior.points)

@@ -4,13 +4,10 @@ import json
 import os
 import signal
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.robot import load_robot
 from node_graph import Client, fresh_domain, Process, wait_until
+import numpy as np
+import pytest
 
 pytestmark = pytest.mark.timeout(200)
 TOPICS = ('tof/points', 'imu/data_raw', 'strain')

@@ -22,7 +22,7 @@ CERTAIN = 2.0  # times the deviations asked for, and one test will do
 MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
 KNOWN_FOR = 1.0  # [s] that what was found of the clocks holds without another test
 STILL_SIGMAS = 3.0  # for a clock known to be off
-NOISY = 'noisy'
+NOISY, MISFIT = 'noisy', 'does not fit'
 
 
 class Health:
@@ -70,13 +70,14 @@ class Health:
         Judge every sensor.
 
         body_believed: a search found no better body. body_doubted: it may be in a wrong place,
-        where clocks that are right do not fit either.
+        where clocks that are right do not fit either; so do they not beside a sensor that pulls
+        the body off.
         """
         reasons = dict.fromkeys(self._noisy(), NOISY)
         for name in self._misfits():
             if body_believed or name in self.disbelieved or name not in self._tof_names:
-                reasons[name] = 'does not fit'
-        if not body_doubted:
+                reasons[name] = MISFIT
+        if not body_doubted and MISFIT not in reasons.values():
             self._look_at_clocks(time)
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}
@@ -98,7 +99,7 @@ class Health:
         return misfits
 
     def _noisy(self) -> list[str]:
-        """ToF sensors whose zones match the map in one frame and not in the next."""
+        """Name sensors whose zones match the map in one frame and not in the next."""
         flicker = self._window.flicker()
         return [name for name, share in flicker.items() if share > self._settings.flicker_share]
 

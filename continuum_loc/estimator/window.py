@@ -328,7 +328,8 @@ class Window:
         """
         k = self.knot_before(time)
         found: dict[str, np.ndarray] = {}
-        for interval in self.intervals[max(k - 1, 0) : k + 1]:
+        newest = slice(max(k - 1, 0), k + 1)
+        for interval in self.intervals[newest]:
             if 'gyro' in interval.reports:
                 for name, variance in interval.reports['gyro'].rattle.items():
                     found[name] = np.maximum(found.get(name, 0.0), variance)
