@@ -3,6 +3,7 @@
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
 from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.factors.gyro import judge
 from continuum_loc.estimator.output import rattle_covariance
 from continuum_loc.estimator.state import Grid
 from continuum_loc.evaluation.trials import _base_drawn
@@ -110,12 +111,18 @@ def test_rattle_is_the_angle_that_residual_rates_integrate_to():
     times = np.arange(0.0, 1.0, 0.005)
     rng, sigma = np.random.default_rng(0), factor._weight**-0.5
     omega, amplitude = 2.0 * np.pi * 9.0, 60.0 * sigma
+
+    def rattle_of(residuals):
+        fits, rattle = np.zeros((1, 2)), np.zeros((1, 3))
+        judge(times, np.zeros(len(times), int), residuals, factor._weight, fits, rattle)
+        return rattle[0]
+
     noise = sigma * rng.normal(size=(len(times), 3))
     swing = amplitude * np.sin(omega * times)[:, None] * [0.0, 1.0, 0.5]
-    variance = factor._rattle(times, swing + noise)
+    variance = rattle_of(swing + noise)
     assert variance[1] == pytest.approx(amplitude**2 / (2.0 * omega**2), rel=0.1)
     assert variance[2] == pytest.approx(variance[1] / 4.0, rel=0.2)
-    walks = [factor._rattle(times, sigma * rng.normal(size=(len(times), 3))) for _ in range(50)]
+    walks = [rattle_of(sigma * rng.normal(size=(len(times), 3))) for _ in range(50)]
     assert np.mean(walks) < 0.02 * variance[2]
 
 

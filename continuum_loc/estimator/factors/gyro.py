@@ -19,6 +19,7 @@ from numba import njit
 import numpy as np
 
 # An IMU fits while its mean residual is below four sigmas of one sample; rattling averages out.
+LEAST_RATTLE = 3  # samples that an angle's variance takes
 RATTLE_SQUARED = 9.0  # three standard deviations of its angle
 CLOCK_STEP = 0.004  # [s] for the slope of the rate
 FIT_SQUARED = 16.0
@@ -131,31 +132,10 @@ class GyroFactor(Factor):
         self, times: np.ndarray, imus: np.ndarray, residuals: np.ndarray
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Count [usable, fitting] samples by IMU, and take the variance (3,) of its rattle."""
-        fits, rattle = {}, {}
-        for number, name in enumerate(self._imus):
-            own = imus == number
-            if not own.any():
-                continue
-            count, mean = int(own.sum()), residuals[own].mean(axis=0)
-            rattle[name] = self._rattle(times[own], residuals[own])
-            # A rattle that ends within the interval leaves a mean rate too.
-            rate2 = RATTLE_SQUARED * np.sum(rattle[name]) / max(np.ptp(times[own]), 1e-3) ** 2
-            fitting = mean @ mean < FIT_SQUARED / self._weight + rate2
-            fits[name] = np.array([count, count * fitting])
-        return fits, rattle
-
-    def _rattle(self, times: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """
-        Variance (3,) of the angle that residual rates (M, 3) at times (M,) integrate to [rad^2].
-
-        White noise of the gyro alone makes a random walk of variance T / 6 about its mean, which
-        is taken off.
-        """
-        if len(times) < 3:
-            return np.zeros(3)
-        steps = np.diff(times)[:, None] * 0.5 * (residuals[1:] + residuals[:-1])
-        walk = np.median(np.diff(times)) * (times[-1] - times[0]) / (6.0 * self._weight)
-        return np.maximum(np.var(np.cumsum(steps, axis=0), axis=0) - walk, 0.0)
+        fits, rattle = np.zeros((len(self._imus), 2)), np.zeros((len(self._imus), 3))
+        judge(times, imus, residuals, self._weight, fits, rattle)
+        heard = [(number, name) for number, name in enumerate(self._imus) if fits[number, 0] > 0.0]
+        return {name: fits[n] for n, name in heard}, {name: rattle[n] for n, name in heard}
 
 
 @njit(cache=True)
@@ -249,3 +229,47 @@ def _add_clocks(
             coupling[bias_offset + 3 * imu + i - 3, s] += slope
             for j in range(24):
                 coupling[index[j], s] += slope * J_rate[i, j]
+
+
+@njit(cache=True)
+def judge(times, imus, residuals, weight, fits, rattle):
+    """
+    Write [usable, fitting] samples and the variance (3,) of the rattle's angle, by IMU.
+
+    The angle is what residual rates (M, 3) at increasing times (M,) integrate to [rad]; white
+    noise of the gyro alone makes it a random walk of variance T / 6 about its mean, taken off.
+    """
+    number = fits.shape[0]
+    first, last, before = np.zeros(number), np.zeros(number), np.zeros((number, 3))
+    angle, mean = np.zeros((number, 3)), np.zeros((number, 3))
+    total, squares = np.zeros((number, 3)), np.zeros((number, 3))
+    for m in range(times.shape[0]):
+        n = imus[m]
+        if fits[n, 0] == 0.0:
+            first[n] = times[m]
+        for i in range(3):
+            if fits[n, 0] > 0.0:
+                step = times[m] - last[n]
+                angle[n, i] += 0.5 * step * (residuals[m, i] + before[n, i])
+            before[n, i] = residuals[m, i]
+            mean[n, i] += residuals[m, i]
+            total[n, i] += angle[n, i]
+            squares[n, i] += angle[n, i] * angle[n, i]
+        last[n] = times[m]
+        fits[n, 0] += 1.0
+    for n in range(number):
+        count = fits[n, 0]
+        if count == 0.0:
+            continue
+        span = last[n] - first[n]
+        mean2, rattled = 0.0, 0.0
+        for i in range(3):
+            mean2 += (mean[n, i] / count) ** 2
+            if count >= LEAST_RATTLE:
+                walk = span * span / (count - 1.0) / (6.0 * weight)
+                spread = squares[n, i] / count - (total[n, i] / count) ** 2
+                rattle[n, i] = max(spread - walk, 0.0)
+            rattled += rattle[n, i]
+        # A rattle that ends within the interval leaves a mean rate too.
+        allowed = FIT_SQUARED / weight + RATTLE_SQUARED * rattled / max(span, 1e-3) ** 2
+        fits[n, 1] = count if mean2 < allowed else 0.0
