@@ -13,7 +13,7 @@ from continuum_loc.estimator import (
     SlidingWindowFilter,
     smooth,
 )
-from continuum_loc.measurements import ImuSample, TofFrame, TruthSample
+from continuum_loc.measurements import ImuSample, StrainSample, TofFrame, TruthSample
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.world import World
@@ -317,3 +317,17 @@ def test_field_gravity_and_gyros_track_the_hall_arm():
         median.append(np.median(distance))
     assert median[0] < 2e-4
     assert median[1] > 10.0 * median[0]
+
+
+def test_the_first_estimate_waits_for_what_tells_the_shape(prior_map):
+    """Strain that arrives after the first ToF frames, as it may on a graph, is waited for."""
+    robot = rod()
+    samples = list(stream(Rod(robot, seed=2), 1.0))
+    strain = [s for s in samples if isinstance(s, StrainSample)]
+    others = [s for s in samples if not isinstance(s, StrainSample)]
+    late = [s for s in others if s.stamp - EPOCH < 0.2e9] + strain
+    late += [s for s in others if s.stamp - EPOCH >= 0.2e9]
+    for order, first in ((samples, 0.0), (late, 0.1), (others, 0.4)):
+        estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), order)
+        assert (estimates[0].stamp - EPOCH) * 1e-9 >= first
+        assert np.max(np.abs(errors(estimates[:5], truth)[:, :, :3])) < 0.02

@@ -24,12 +24,20 @@ from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import column_at_rest, Grid
 from continuum_loc.estimator.window import Fit, TIME_EPSILON, Window
-from continuum_loc.measurements import Measurement, nanoseconds, seconds, TofFrame
+from continuum_loc.measurements import (
+    EncoderSample,
+    Measurement,
+    nanoseconds,
+    seconds,
+    StrainSample,
+    TofFrame,
+)
 from continuum_loc.robot import RobotDescription
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 PATIENCE = 1.5  # ToF periods that a cycle waits for silent sensors
+FIRST_PATIENCE = 0.5  # [s] that the first step waits for what tells base and shape
 
 
 class SlidingWindowFilter:
@@ -76,11 +84,21 @@ class SlidingWindowFilter:
             self.robot, self.window, self.tof, self.health, self.settings.recovery
         )
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
+        self._awaited = self._tellers()
         self._cycle: set[str] = set()
         self._last_cycle: set[str] = set()
         self._cycle_start: int | None = None
         self._cycle_stamp: int = 0
         self._output: int = 0
+
+    def _tellers(self) -> set[type]:
+        """Kinds of samples without which the first guess of base and shape is a poor one."""
+        tellers: set[type] = set()
+        if self.robot.base.insertion.mode == 'measured':
+            tellers.add(EncoderSample)
+        if self.robot.strain is not None and self.settings.strain.enabled:
+            tellers.add(StrainSample)
+        return tellers
 
     def _make_tof(self, prior_map) -> TofFactor | None:
         if prior_map is None or not self.settings.tof.enabled or not self.robot.tof:
@@ -164,6 +182,7 @@ class SlidingWindowFilter:
         if any(used):
             self.counts['used'][type(measurement).__name__] += 1
             self.newest = max(self.newest, measurement.stamp)
+            self._awaited.discard(type(measurement))
             self._rest.note(measurement)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
         return any(used)
@@ -217,7 +236,8 @@ class SlidingWindowFilter:
         # The ToF frames set the time: a clock that runs ahead of theirs must not.
         self._output = max(self._cycle_stamp if self._cycle else self.newest, self._output)
         self._last_cycle, self._cycle, self._cycle_start = self._cycle, set(), None
-        if not self.window.intervals:
+        early = seconds(self.newest, self.epoch) < FIRST_PATIENCE
+        if not self.window.intervals or (self._awaited and early):
             return None
         started = clock.perf_counter()
         with self._threads.limit(limits=1, user_api='blas'):
