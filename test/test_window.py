@@ -331,3 +331,24 @@ def test_the_first_estimate_waits_for_what_tells_the_shape(prior_map):
         estimates, truth = run(SlidingWindowFilter(robot, prior_map, settings()), order)
         assert (estimates[0].stamp - EPOCH) * 1e-9 >= first
         assert np.max(np.abs(errors(estimates[:5], truth)[:, :, :3])) < 0.02
+
+
+def test_a_window_restored_knows_what_it_knew(prior_map):
+    """Shortened and put into another shape, then restored: body and covariance are as before."""
+    filter_ = SlidingWindowFilter(rod(), prior_map, settings())
+    run(filter_, stream(Rod(rod(), seed=5), 2.0))
+    window = filter_.window
+    time, rings = window.columns[-2].time, filter_.grid.ring_nodes
+    body, covariance = window.body(time), window.motion_covariance(time, rings)
+    kept = window.snapshot()
+    window.keep_newest(2)
+    window.place(window.columns[-1].predict(0.5))
+    window.track()
+    assert not np.allclose(window.motion_covariance(time, rings), covariance, rtol=0.1)
+    window.restore(kept)
+    np.testing.assert_allclose(window.body(time).T, body.T, atol=1e-4)
+    np.testing.assert_allclose(
+        np.trace(window.motion_covariance(time, rings), axis1=1, axis2=2),
+        np.trace(covariance, axis1=1, axis2=2),
+        rtol=0.02,
+    )

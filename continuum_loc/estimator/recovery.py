@@ -94,6 +94,21 @@ class Snapshot:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Try:
+    """
+    A body that was tried.
+
+    Cost of its measurements, mean share of zones that fit, number of sensors of which (nearly)
+    all do, its columns.
+    """
+
+    cost: float
+    share: float
+    whole: int
+    columns: list[Column]
+
+
 class Recovery:
     """
     Acquires the body at the start, watches over it, and finds it again.
@@ -256,21 +271,6 @@ class Recovery:
         tof = np.array([shares[name] for name in self._tof.weights if name in shares])
         whole = int(np.sum(tof >= self._settings.suspect_share))
         return Try(self._window.measurement_cost(), float(np.mean(tof)), whole, columns)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Try:
-    """
-    A body that was tried.
-
-    Cost of its measurements, mean share of zones that fit, number of sensors of which (nearly)
-    all do, its columns.
-    """
-
-    cost: float
-    share: float
-    whole: int
-    columns: list[Column]
 
 
 def _cost(one: Try) -> float:

@@ -5,10 +5,11 @@ Beside the published C++ sliding-window filter and Hermite curves.
 
 The trials are found through the environment variable CONTINUUM_LOC_DATA: a folder that holds
 `slow_free_space` and `impulse_2`. Motion capture is the truth and never an input. Errors are taken
-at every stamp of motion capture in
-the windows that the published figures are for: the estimate there lies on the Gaussian process
-between the two estimates around it; Hermite curves lie between the two tracked poses, interpolated
-to that stamp.
+at every stamp of motion capture in the windows that the published figures are for: the estimate
+there lies on the Gaussian process between the two estimates around it; Hermite curves lie between
+the two tracked poses, interpolated to that stamp. Tracked poses that the logger only held are
+dropped and the stamps of the others evened out; the published figures, Hermite's among them, are
+of the poses as logged.
 
 The filter's numbers are the same for both trials and were chosen on the rest of them (`TUNED_ON`),
 but not blindly: errors inside the windows were seen while choosing, and the backbone's effective
