@@ -18,6 +18,7 @@ from continuum_loc.robot import RobotDescription
 import numpy as np
 
 HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt, not a sensor
+RECENT = 2  # intervals that say whether a ToF sensor fits now
 CERTAIN = 2.0  # times the deviations asked for, and one test will do
 MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
 KNOWN_FOR = 1.0  # [s] that what was found of the clocks holds without another test
@@ -90,6 +91,8 @@ class Health:
     def _misfits(self) -> list[str]:
         """Sensors that do not fit while others of their kind do: a wrong mount, a broken part."""
         shares, misfits = self._window.fit().shares, []
+        recent = self._window.fit(newest=RECENT).shares  # a knocked ToF sensor shows at once
+        shares |= {name: recent[name] for name in self._tof_names if name in recent}
         for kind in self._kinds:
             names = [name for name in kind if name in shares]
             healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE

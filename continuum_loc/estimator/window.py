@@ -277,11 +277,11 @@ class Window:
 
     # ------------------------------------------------------------------ what it says
 
-    def fit(self) -> Fit:
-        """How all measurements in the window fit."""
+    def fit(self, newest: int = 0) -> Fit:
+        """How the measurements in the window fit, or in its `newest` intervals."""
         squared, count = 0.0, 0
         samples: dict[str, np.ndarray] = {}
-        for interval in self.intervals:
+        for interval in self.intervals[-newest:]:
             for report in interval.reports.values():
                 squared += report.squared
                 count += report.count
