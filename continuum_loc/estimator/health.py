@@ -53,11 +53,6 @@ class Health:
         self._next_clocks = self._clocks_known = 0.0
 
     @property
-    def suspects(self) -> tuple[str, ...]:
-        """Names of the sensors that are suspect."""
-        return tuple(self.reasons)
-
-    @property
     def disbelieved(self) -> set[str]:
         """Suspects whose samples tell nothing of the body; noise alone the loss deals with."""
         return {name for name, reason in self.reasons.items() if reason != NOISY}
@@ -121,12 +116,8 @@ class Health:
         for sensor in self._robot.tof if self._tof_names else ():
             rings[sensor.ring].append(sensor.name)
         alone = [(name,) for kind in self._kinds for name in kind]
-        return list(
-            dict.fromkeys([*alone, *(tuple(m) for m in rings.values() if m), *self._all()])
-        )
-
-    def _all(self) -> list[tuple[str, ...]]:
-        return [tuple(self._tof_names)] if self._tof_names else []
+        together = [tuple(names) for names in (*rings.values(), self._tof_names) if names]
+        return list(dict.fromkeys([*alone, *together]))
 
     def _look_at_clocks(self, time: float) -> None:
         """Test the clocks now and then."""
