@@ -267,19 +267,21 @@ def right_inverse_coefficients(x, c, dc):
 @njit(cache=True)
 def polynomial(c, A, out, work):
     """
-    Out = c0 I + c1 A + ... + c4 A^4 by Horner's rule.
+    Out = c0 I + c1 A + (c2 I + c3 A + c4 A^2) A^2: two products.
 
-    A of the form [[X, Y], [0, X]]; work (6, 6).
+    A of the form [[X, Y], [0, X]]; work (2, 6, 6).
     """
-    out[:, :] = 0.0
+    square, outer = work[0], work[1]
+    block_product(A, A, square)
     for i in range(6):
-        out[i, i] = c[4]
-    for k in range(3, -1, -1):
-        block_product(A, out, work)
-        for i in range(6):
-            for j in range(6):
-                out[i, j] = work[i, j]
-            out[i, i] += c[k]
+        for j in range(6):
+            outer[i, j] = c[3] * A[i, j] + c[4] * square[i, j]
+        outer[i, i] += c[2]
+    block_product(outer, square, out)
+    for i in range(6):
+        for j in range(6):
+            out[i, j] += c[1] * A[i, j]
+        out[i, i] += c[0]
 
 
 @njit(cache=True)
@@ -333,6 +335,16 @@ def _subtract_ad(D, x):
     D[1, 5] += x[0]
     D[2, 3] += x[1]
     D[2, 4] -= x[0]
+
+
+@njit(cache=True)
+def pose_error(T_wanted, T, e, J, W, V, M):
+    """Write e (6,) = Log(T_wanted^-1 T) and its Jacobian J (6, 6) by T; W, V, M a workspace."""
+    relative(T_wanted, T, M[0])
+    log(M[0], e)
+    ad(e, W[0])
+    right_inverse_coefficients(e, V[0], V[1])
+    polynomial(V[0], W[0], J, W[1:3])
 
 
 @njit(cache=True)

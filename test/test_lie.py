@@ -74,7 +74,7 @@ def test_kernels_agree_with_the_batch_functions(angle):
         lie_kernels.adjoint(T, A)
         np.testing.assert_allclose(A, lie.adjoint(T), atol=1e-14)
         lie_kernels.ad(xi, A)
-        c, dc, out, work = np.empty(5), np.empty(5), np.empty((6, 6)), np.empty((6, 6))
+        c, dc, out, work = np.empty(5), np.empty(5), np.empty((6, 6)), np.empty((2, 6, 6))
         for coefficients, oracle in (
             (lie_kernels.right_coefficients, lie.right_jacobian),
             (lie_kernels.right_inverse_coefficients, lie.right_jacobian_inverse),

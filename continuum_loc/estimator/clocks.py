@@ -138,4 +138,4 @@ def _gather(window: Window, factors: Sequence[Factor]):
         C[k + 1][:, at] += scores.coupling[dim:]
         spread[at] += scores.spread
         count[at] += 1.0
-    return list(names), g, h, C, spread / count
+    return list(names), g, h, C, spread / np.maximum(count, 1.0)

@@ -23,41 +23,34 @@ import numpy as np
 
 
 @njit(cache=True)
-def _relative_twist(T_a, T_b, v_b, W, V, M):
+def relate(T_a, T_b, v_b, W, V, M):
     """
-    Relative pose's logarithm and rate, with their Jacobians.
+    Relative pose's logarithm and rate, with what their Jacobians are made of.
 
-    xi in V[0], w = J_r(xi)^-1 v_b in V[3], J_r(xi)^-1 in W[1], J_l(xi)^-1 in W[2], dw/dxi in W[3].
+    xi in V[0], w = J_r(xi)^-1 v_b in V[3]; J_r(xi)^-1 in W[1], J_l(xi)^-1 in W[2], dw/dxi in W[3]
+    and its products with those two in W[4] and W[5].
     """
     lk.relative(T_a, T_b, M[0])
     lk.log(M[0], V[0])
     lk.ad(V[0], W[0])
     lk.right_inverse_coefficients(V[0], V[1], V[2])
-    lk.polynomial(V[1], W[0], W[1], W[2])
-    lk.polynomial_times(V[1], V[2], V[0], W[0], v_b, V[3], W[3], W[4:6], V[4:9])
+    lk.polynomial(V[1], W[0], W[1], W[6:8])
+    lk.polynomial_times(V[1], V[2], V[0], W[0], v_b, V[3], W[3], W[6:8], V[4:9])
     for i in range(6):
         for j in range(6):
             W[2, i, j] = W[1, i, j] - W[0, i, j]  # J_l^-1 = J_r^-1 - ad(xi)
+    lk.product(W[3], W[1], W[4])
+    lk.product(W[3], W[2], W[5])
 
 
 @njit(cache=True)
-def _chain_rate(scale_xi, scale_a, scale_w, W, J, scratch):
-    """J (6, 24) of scale_xi xi + scale_a v_a + scale_w w, from the W of `_relative_twist`."""
-    G = scratch[0]
+def _chain_rate(scale_xi, scale_a, scale_w, W, J):
+    """J (6, 24) of scale_xi xi + scale_a v_a + scale_w w, from the W of `relate`."""
     for i in range(6):
         for j in range(6):
-            G[i, j] = scale_w * W[3, i, j]
-        G[i, i] += scale_xi
-    for i in range(6):
-        for j in range(6):
-            by_a = 0.0
-            by_b = 0.0
-            for k in range(6):
-                by_a += G[i, k] * W[2, k, j]
-                by_b += G[i, k] * W[1, k, j]
-            J[i, j] = -by_a
+            J[i, j] = -(scale_xi * W[2, i, j] + scale_w * W[5, i, j])
             J[i, 6 + j] = 0.0
-            J[i, 12 + j] = by_b
+            J[i, 12 + j] = scale_xi * W[1, i, j] + scale_w * W[4, i, j]
             J[i, 18 + j] = scale_w * W[1, i, j]
         J[i, 6 + i] = scale_a
 
@@ -69,47 +62,86 @@ def hermite(T_a, v_a, T_b, v_b, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
 
     W, V, M come from `lie_kernels.workspace`, J_work is (2, 6, 24).
     """
-    _relative_twist(T_a, T_b, v_b, W, V, M)
+    relate(T_a, T_b, v_b, W, V, M)
+    evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work)
+
+
+@njit(cache=True)
+def evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
+    """`hermite` between two states that `relate` left in the workspace: any number of times."""
+    rate_at(v_a, d, tau, v, W, V)
+    u = tau / d
+    by_gamma, by_rate = J_work[0], J_work[1]
+    _chain_rate(
+        u * u * (3.0 - 2.0 * u), u * (1.0 - u) ** 2 * d, u * u * (u - 1.0) * d, W, by_gamma
+    )
+    _chain_rate(
+        6.0 * u * (1.0 - u) / d, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0), W, by_rate
+    )
+    _advance(T_a, T, V, M)
+    lk.polynomial(V[11], W[6], W[8], W[9:11])
+    lk.relative(T, T_a, M[2])
+    lk.adjoint(M[2], W[9])
+    for i in range(6):
+        for j in range(24):
+            J_pose[i, j] = W[9, i, j] if j < 6 else 0.0
+            J_rate[i, j] = 0.0
+        for k in range(6):  # the innermost loop is over neighbours in memory
+            by_pose, by_turn = W[8, i, k], W[7, i, k]
+            for j in range(24):
+                J_pose[i, j] += by_pose * by_gamma[k, j]
+                J_rate[i, j] += by_turn * by_gamma[k, j] + by_pose * by_rate[k, j]
+
+
+@njit(cache=True)
+def _local(v_a, d, tau, V):
+    """Gamma into V[9] and its derivative into V[10], from what `relate` left in V."""
     u = tau / d
     h1, h2, h3 = u * u * (3.0 - 2.0 * u), u * (1.0 - u) * (1.0 - u) * d, -u * u * (1.0 - u) * d
     g1, g2, g3 = 6.0 * u * (1.0 - u) / d, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)
-    gamma, rate = V[9], V[10]
     for i in range(6):
-        gamma[i] = h1 * V[0, i] + h2 * v_a[i] + h3 * V[3, i]
-        rate[i] = g1 * V[0, i] + g2 * v_a[i] + g3 * V[3, i]
-    by_gamma, by_rate = J_work[0], J_work[1]
-    _chain_rate(h1, h2, h3, W, by_gamma, W[6:8])
-    _chain_rate(g1, g2, g3, W, by_rate, W[6:8])
-    lk.exp(gamma, M[1])
+        V[9, i] = h1 * V[0, i] + h2 * v_a[i] + h3 * V[3, i]
+        V[10, i] = g1 * V[0, i] + g2 * v_a[i] + g3 * V[3, i]
+
+
+@njit(cache=True)
+def _advance(T_a, T, V, M):
+    """T = T_a Exp(gamma), gamma from V[9]."""
+    lk.exp(V[9], M[1])
     lk.compose(T_a, M[1], T)
+
+
+@njit(cache=True)
+def pose_at(T_a, v_a, d, tau, T, V, M):
+    """Pose T (4, 4) alone, between two states that `relate` left in the workspace."""
+    _local(v_a, d, tau, V)
+    _advance(T_a, T, V, M)
+
+
+@njit(cache=True)
+def rate_at(v_a, d, tau, v, W, V):
+    """
+    Rate v (6,) alone, between two states that `relate` left in the workspace.
+
+    Leaves gamma in V[9], ad(gamma) in W[6], the derivative of J_r(gamma) gamma' by gamma in W[7]
+    and the coefficients of J_r in V[11].
+    """
+    _local(v_a, d, tau, V)
+    gamma, rate = V[9], V[10]
     lk.ad(gamma, W[6])
     lk.right_coefficients(gamma, V[11], V[12])
-    lk.polynomial(V[11], W[6], W[7], W[8])
-    lk.polynomial_times(V[11], V[12], gamma, W[6], rate, v, W[9], W[4:6], V[4:9])
-    lk.relative(T, T_a, M[2])
-    lk.adjoint(M[2], W[10])
-    for i in range(6):
-        for j in range(24):
-            pose = 0.0
-            velocity = 0.0
-            for k in range(6):
-                pose += W[7, i, k] * by_gamma[k, j]
-                velocity += W[9, i, k] * by_gamma[k, j] + W[7, i, k] * by_rate[k, j]
-            J_pose[i, j] = pose
-            J_rate[i, j] = velocity
-        for j in range(6):
-            J_pose[i, j] += W[10, i, j]
+    lk.polynomial_times(V[11], V[12], gamma, W[6], rate, v, W[7], W[8:10], V[4:9])
 
 
 @njit(cache=True)
 def motion_error(T_a, v_a, T_b, v_b, d, e, J, W, V, M):
     """Prior error e (12,) = [xi - d v_a; w - v_a] and its Jacobian J (12, 24)."""
-    _relative_twist(T_a, T_b, v_b, W, V, M)
+    relate(T_a, T_b, v_b, W, V, M)
     for i in range(6):
         e[i] = V[0, i] - d * v_a[i]
         e[6 + i] = V[3, i] - v_a[i]
-    _chain_rate(1.0, -d, 0.0, W, J[:6], W[6:8])
-    _chain_rate(0.0, -1.0, 1.0, W, J[6:], W[6:8])
+    _chain_rate(1.0, -d, 0.0, W, J[:6])
+    _chain_rate(0.0, -1.0, 1.0, W, J[6:])
 
 
 @njit(cache=True)
@@ -204,13 +236,8 @@ def add_local(H, g, index, H_local, g_local, J, work):
 
     Work (m, n).
     """
+    _weigh(H_local, J, work)
     m, n = J.shape
-    for i in range(m):
-        for j in range(n):
-            total = 0.0
-            for k in range(m):
-                total += H_local[i, k] * J[k, j]
-            work[i, j] = total
     for j in range(n):
         row = index[j]
         for i in range(m):
@@ -220,6 +247,59 @@ def add_local(H, g, index, H_local, g_local, J, work):
             for i in range(m):
                 total += J[i, j] * work[i, k]
             H[row, index[k]] += total
+
+
+@njit(cache=True)
+def gather(H_sum, g_sum, H_local, g_local, J, work):
+    """
+    Add a local information block (m, m), (m,), chained through J (m, n), to H_sum (n, n), g_sum.
+
+    For many measurements of the same states, before one `scatter`.
+    """
+    _weigh(H_local, J, work)
+    m, n = J.shape
+    for j in range(n):
+        for i in range(m):
+            slope = J[i, j]
+            g_sum[j] += slope * g_local[i]
+            for k in range(n):
+                H_sum[j, k] += slope * work[i, k]
+
+
+@njit(cache=True)
+def gather_rows(H_sum, g_sum, e, J, weight):
+    """Add weight |e + J x|^2 / 2 to H_sum (n, n), g_sum (n,), before one `scatter`."""
+    for i in range(e.shape[0]):
+        for j in range(J.shape[1]):
+            scaled = weight * J[i, j]
+            g_sum[j] += scaled * e[i]
+            for k in range(J.shape[1]):
+                H_sum[j, k] += scaled * J[i, k]
+
+
+@njit(cache=True)
+def scatter(H, g, index, H_sum, g_sum):
+    """Add H_sum (n, n), g_sum (n,) to H, g at the rows `index`, and clear them."""
+    n = index.shape[0]
+    for j in range(n):
+        g[index[j]] += g_sum[j]
+        g_sum[j] = 0.0
+        for k in range(n):
+            H[index[j], index[k]] += H_sum[j, k]
+            H_sum[j, k] = 0.0
+
+
+@njit(cache=True)
+def _weigh(H_local, J, out):
+    """Out (m, n) = H_local J."""
+    m, n = J.shape
+    for i in range(m):
+        for j in range(n):
+            out[i, j] = 0.0
+        for k in range(m):
+            weight = H_local[i, k]
+            for j in range(n):
+                out[i, j] += weight * J[k, j]
 
 
 @njit(cache=True)

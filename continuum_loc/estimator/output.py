@@ -179,27 +179,10 @@ def backbone(grid: Grid, T: np.ndarray, strain: np.ndarray, s: np.ndarray) -> np
 @njit(cache=True)
 def _backbone(T, strain, s, segments, offsets, out):
     W, V, M = lie_kernels.workspace()
-    J_pose, J_rate, J_work, rate = (
-        np.empty((6, 24)),
-        np.empty((6, 24)),
-        np.empty((2, 6, 24)),
-        np.empty(6),
-    )
+    related = -1
     for m in range(segments.shape[0]):
         n = segments[m]
-        gp.hermite(
-            T[n],
-            strain[n],
-            T[n + 1],
-            strain[n + 1],
-            s[n + 1] - s[n],
-            offsets[m],
-            out[m],
-            rate,
-            J_pose,
-            J_rate,
-            W,
-            V,
-            M,
-            J_work,
-        )
+        if n != related:
+            gp.relate(T[n], T[n + 1], strain[n + 1], W, V, M)
+            related = n
+        gp.pose_at(T[n], strain[n], s[n + 1] - s[n], offsets[m], out[m], V, M)

@@ -100,7 +100,7 @@ class Priors:
             self.velocity,
             self.strain_rate,
         )
-        self._add_bias(blocks, a, b, dt)
+        _add_bias(blocks.H, blocks.g, a.bias, b.bias, self.bias_rate / dt, self.grid.bias_offset)
         squared += self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
         blocks.cost += 0.5 * squared
 
@@ -123,29 +123,15 @@ class Priors:
             self.rest,
             self.rest_information * share,
         )
-        e = lie.log(lie.inverse(self.T_map_base) @ column.T[0])
-        J = lie.right_jacobian_inverse(e)
-        weight = self.base_information * share
-        H[:6, :6] += J.T @ (weight[:, None] * J)
-        g[:6] += J.T @ (weight * e)
-        at = np.arange(VELOCITY, VELOCITY + 6)
-        H[at, at] += self.base_rate_information * share
-        g[at] += self.base_rate_information * share * column.velocity[0]
-        return (
-            squared + weight @ e**2 + share * self.base_rate_information @ column.velocity[0] ** 2
+        return squared + _add_base(
+            H,
+            g,
+            column.T[0],
+            column.velocity[0],
+            self.T_map_base,
+            self.base_information * share,
+            self.base_rate_information * share,
         )
-
-    def _add_bias(self, blocks: Blocks, a: Column, b: Column, dt: float) -> None:
-        D, weight = self.grid.dim, self.bias_rate / dt
-        older = np.arange(self.grid.bias_offset, D)
-        newer = older + D
-        e = weight * (b.bias - a.bias).ravel()
-        blocks.H[older, older] += weight
-        blocks.H[newer, newer] += weight
-        blocks.H[older, newer] -= weight
-        blocks.H[newer, older] -= weight
-        blocks.g[older] -= e
-        blocks.g[newer] += e
 
 
 @njit(cache=True)
@@ -202,6 +188,40 @@ def _add_space(
             weights[i] = slope_information[i] / ds
         squared += gp.add_rows(H, g, index, e[:6], J[:6], weights)
     return squared
+
+
+@njit(cache=True)
+def _add_base(H, g, T, velocity, T_map_base, information, rate_information):
+    W, V, M = lie_kernels.workspace()
+    e, J = np.empty(6), np.empty((6, 6))
+    lie_kernels.pose_error(T_map_base, T, e, J, W, V, M)
+    squared = 0.0
+    for i in range(6):
+        squared += information[i] * e[i] * e[i] + rate_information[i] * velocity[i] * velocity[i]
+        for j in range(6):
+            weighted = information[i] * J[i, j]
+            g[j] += weighted * e[i]
+            for k in range(6):
+                H[j, k] += weighted * J[i, k]
+        H[VELOCITY + i, VELOCITY + i] += rate_information[i]
+        g[VELOCITY + i] += rate_information[i] * velocity[i]
+    return squared
+
+
+@njit(cache=True)
+def _add_bias(H, g, bias_a, bias_b, weight, bias_offset):
+    size = H.shape[0] // 2
+    for m in range(bias_a.shape[0]):
+        for i in range(3):
+            older = bias_offset + 3 * m + i
+            newer = older + size
+            step = weight * (bias_b[m, i] - bias_a[m, i])
+            H[older, older] += weight
+            H[newer, newer] += weight
+            H[older, newer] -= weight
+            H[newer, older] -= weight
+            g[older] -= step
+            g[newer] += step
 
 
 @njit(cache=True)

@@ -183,8 +183,8 @@ class Window:
             offsets = self._solve(first, 0.0)
             move = self._largest_move(offsets)
             first = self._move(offsets)
-            if move < self.settings.solver.tolerance:
-                return iteration, True
+            if move < self.settings.solver.tolerance or first == len(self.intervals):
+                return iteration, True  # what was linearised where it is, is solved exactly
         return limit, False
 
     def acquire(self, narrow: Callable[[int], bool]) -> tuple[int, bool]:

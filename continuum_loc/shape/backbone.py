@@ -199,7 +199,7 @@ def _forward(strain, lengths):
     chain = np.zeros((arcs, 6, 3 * arcs))
     xi, c, dc = np.zeros(6), np.empty(5), np.empty(5)
     arc, back = np.empty((4, 4)), np.empty((4, 4))
-    A, J, work, carry = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    A, J, work, carry = np.empty((6, 6)), np.empty((6, 6)), np.empty((2, 6, 6)), np.empty((6, 6))
     identity = np.eye(4)
     for n in range(arcs):
         xi[0] = lengths[n]

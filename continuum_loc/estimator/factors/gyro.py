@@ -62,8 +62,9 @@ class GyroFactor(Factor):
         return number, node, R_ring_imu @ measurement.angular_velocity
 
     def stack(self, times, rows):
-        order = np.argsort(times, kind='stable')  # `_turned` integrates, whatever came late
-        return (times[order], *(np.array([rows[m][i] for m in order]) for i in range(3)))
+        imus, nodes, omega = (np.array([row[i] for row in rows]) for i in range(3))
+        order = np.lexsort((times, imus))  # `judge` integrates, whatever came late
+        return times[order], imus[order], nodes[order], omega[order]
 
     def linearise(self, batch, a, b, blocks):
         times, imus, nodes, omega = batch
@@ -95,15 +96,14 @@ class GyroFactor(Factor):
 
     def clock_scores(self, batch, a, b):
         times, imus, nodes, omega = batch
-        names, number = np.unique(imus, return_inverse=True)
-        gradient, information = np.zeros(len(names)), np.zeros(len(names))
-        coupling, squared = np.zeros((2 * self.grid.dim, len(names))), np.zeros(len(names))
+        number = len(self._imus)
+        gradient, information, squared = np.zeros((3, number))
+        coupling = np.zeros((2 * self.grid.dim, number))
         _add_clocks(
             gradient,
             information,
             coupling,
             squared,
-            number,
             a.T,
             a.velocity,
             b.T,
@@ -116,16 +116,16 @@ class GyroFactor(Factor):
             omega,
             self.grid.bias_offset,
         )
-        weight = self._weight * self._shares()[names]
+        weight = self._weight * self._shares()
         # What no offset explains of the rates may be more than noise: a body that rattles.
         unexplained = squared - gradient**2 / np.maximum(information, 1e-12)
-        sensors = list(self._imus)
+        samples = np.maximum(np.bincount(imus, minlength=number), 1)
         return ClockScores(
-            [sensors[i] for i in names],
+            list(self._imus),
             weight * gradient,
             weight * information,
             weight * coupling,
-            self._weight * unexplained / (3.0 * np.bincount(number)),
+            self._weight * unexplained / (3.0 * samples),
         )
 
     def _judge(
@@ -161,27 +161,30 @@ def _add(
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
-    J, index, e, weights = np.zeros((3, 27)), np.empty(27, np.int64), np.empty(3), np.empty(3)
+    J, index, e = np.zeros((3, 27)), np.empty(27, np.int64), np.empty(3)
+    H_imu, g_imu = np.zeros((27, 27)), np.zeros(27)
     size = H.shape[0] // 2
-    cost, squared = 0.0, 0.0
+    cost, squared, related = 0.0, 0.0, -1
     for m in range(times.shape[0]):
         n = nodes[m]
-        gp.hermite(
-            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work
-        )
-        gp.time_index(n, VELOCITY, size, index)
+        if n != related:  # samples of an IMU come after one another
+            gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
+            related = n
+        gp.evaluate(T_a[n], v_a[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
         u2 = 0.0
         for i in range(3):
             e[i] = v[3 + i] + bias[imus[m], i] - omega[m, i]
             u2 += weight * e[i] * e[i]
-            index[24 + i] = bias_offset + 3 * imus[m] + i
             for j in range(24):
                 J[i, j] = J_rate[3 + i, j]
             J[i, 24 + i] = 1.0
         robust = 1.0 / (1.0 + u2 / (cauchy * cauchy))
-        for i in range(3):
-            weights[i] = shares[imus[m]] * weight * robust
-        gp.add_rows(H, g, index, e, J, weights)
+        gp.gather_rows(H_imu, g_imu, e, J, shares[imus[m]] * weight * robust)
+        if m + 1 == times.shape[0] or imus[m + 1] != imus[m]:
+            gp.time_index(n, VELOCITY, size, index)
+            for i in range(3):
+                index[24 + i] = bias_offset + 3 * imus[m] + i
+            gp.scatter(H, g, index, H_imu, g_imu)
         residuals[m] = e
         cost += 0.5 * shares[imus[m]] * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
         squared += u2 * robust
@@ -194,7 +197,6 @@ def _add_clocks(
     information,
     coupling,
     squared,
-    sensors,
     T_a,
     v_a,
     T_b,
@@ -212,23 +214,26 @@ def _add_clocks(
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
     before, after, index = np.empty(6), np.empty(6), np.empty(24, np.int64)
+    related = -1
     for m in range(times.shape[0]):
-        n, s, imu = nodes[m], sensors[m], imus[m]
+        n, imu = nodes[m], imus[m]
+        if n != related:  # samples of an IMU come after one another
+            gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
+            gp.time_index(n, VELOCITY, coupling.shape[0] // 2, index)
+            related = n
         t0, t1 = max(times[m] - CLOCK_STEP, 0.0), min(times[m] + CLOCK_STEP, dt)
-        a, b = (T_a[n], v_a[n]), (T_b[n], v_b[n])
-        gp.hermite(a[0], a[1], b[0], b[1], dt, t0, T, before, J_pose, J_rate, W, V, M, J_work)
-        gp.hermite(a[0], a[1], b[0], b[1], dt, t1, T, after, J_pose, J_rate, W, V, M, J_work)
-        gp.hermite(a[0], a[1], b[0], b[1], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
-        gp.time_index(n, VELOCITY, coupling.shape[0] // 2, index)
+        gp.rate_at(v_a[n], dt, t0, before, W, V)
+        gp.rate_at(v_a[n], dt, t1, after, W, V)
+        gp.evaluate(T_a[n], v_a[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
         for i in range(3, 6):
             slope = (after[i] - before[i]) / (t1 - t0)
             error = v[i] + bias[imu, i - 3] - omega[m, i - 3]
-            squared[s] += error * error
-            gradient[s] += slope * error
-            information[s] += slope * slope
-            coupling[bias_offset + 3 * imu + i - 3, s] += slope
+            squared[imu] += error * error
+            gradient[imu] += slope * error
+            information[imu] += slope * slope
+            coupling[bias_offset + 3 * imu + i - 3, imu] += slope
             for j in range(24):
-                coupling[index[j], s] += slope * J_rate[i, j]
+                coupling[index[j], imu] += slope * J_rate[i, j]
 
 
 @njit(cache=True)

@@ -135,11 +135,7 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, T_measured, information, ca
         gp.hermite(
             T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work
         )
-        lie_kernels.relative(T_measured[m], T, M[0])
-        lie_kernels.log(M[0], e)
-        lie_kernels.ad(e, W[0])
-        lie_kernels.right_inverse_coefficients(e, V[0], V[1])
-        lie_kernels.polynomial(V[0], W[0], J, W[1])
+        lie_kernels.pose_error(T_measured[m], T, e, J, W, V, M)
         lie_kernels.apply(information[m], e, weighted)
         u2 = 0.0
         for i in range(6):

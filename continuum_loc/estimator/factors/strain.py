@@ -121,57 +121,25 @@ def _add(
 ):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, rate, J_pose, J_rate = (
-        np.empty((4, 4)),
-        np.empty((2, 6)),
-        np.empty((6, 24)),
-        np.empty((2, 6, 24)),
-    )
+    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
     stations = segments.shape[0]
     local = np.zeros((stations, 4, 4))  # information of [bending at a; bending at b]
     slope = np.zeros((stations, 4))
     values = np.empty((stations, 4))
     jacobians = np.zeros((stations, 4, 48))
-    for m in range(stations):
-        n, ds = segments[m], s[segments[m] + 1] - s[segments[m]]
-        gp.hermite(
-            T_a[n],
-            eps_a[n],
-            T_a[n + 1],
-            eps_a[n + 1],
-            ds,
-            offsets[m],
-            T,
-            rate[0],
-            J_pose,
-            J_rate[0],
-            W,
-            V,
-            M,
-            J_work,
-        )
-        gp.hermite(
-            T_b[n],
-            eps_b[n],
-            T_b[n + 1],
-            eps_b[n + 1],
-            ds,
-            offsets[m],
-            T,
-            rate[1],
-            J_pose,
-            J_rate[1],
-            W,
-            V,
-            M,
-            J_work,
-        )
-        for i in range(2):
-            values[m, i] = rate[0, 4 + i]
-            values[m, 2 + i] = rate[1, 4 + i]
-            for j in range(24):
-                jacobians[m, i, j] = J_rate[0, 4 + i, j]
-                jacobians[m, 2 + i, 24 + j] = J_rate[1, 4 + i, j]
+    for half in range(2):
+        T_end, eps = (T_a, eps_a) if half == 0 else (T_b, eps_b)
+        related = -1
+        for m in range(stations):
+            n, ds = segments[m], s[segments[m] + 1] - s[segments[m]]
+            if n != related:  # stations of a segment come after one another
+                gp.relate(T_end[n], T_end[n + 1], eps[n + 1], W, V, M)
+                related = n
+            gp.evaluate(T_end[n], eps[n], ds, offsets[m], T, rate, J_pose, J_rate, W, V, M, J_work)
+            for i in range(2):
+                values[m, 2 * half + i] = rate[4 + i]
+                for j in range(24):
+                    jacobians[m, 2 * half + i, 24 * half + j] = J_rate[4 + i, j]
     cost, squared = 0.0, 0.0
     c2 = cauchy * cauchy
     for r in range(times.shape[0]):
@@ -195,8 +163,12 @@ def _add(
         cost += 0.5 * c2 * np.log1p(u2 / c2)
         squared += u2 * robust
     index, work = np.empty(48, np.int64), np.empty((4, 48))
+    H_segment, g_segment = np.zeros((48, 48)), np.zeros(48)
     size = H.shape[0] // 2
     for m in range(stations):
+        gp.gather(H_segment, g_segment, local[m], slope[m], jacobians[m], work)
+        if m + 1 < stations and segments[m + 1] == segments[m]:
+            continue
         for i in range(6):
             for half in range(2):
                 start = half * size + NODE_DIM * segments[m]
@@ -204,5 +176,5 @@ def _add(
                 index[24 * half + 6 + i] = start + STRAIN + i
                 index[24 * half + 12 + i] = start + NODE_DIM + i
                 index[24 * half + 18 + i] = start + NODE_DIM + STRAIN + i
-        gp.add_local(H, g, index, local[m], slope[m], jacobians[m], work)
+        gp.scatter(H, g, index, H_segment, g_segment)
     return cost, squared

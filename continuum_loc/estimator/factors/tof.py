@@ -115,6 +115,9 @@ class TofFactor(Factor):
         The association of each row becomes a view into the stacked arrays, so that it outlives the
         next stacking.
         """
+        sensors = np.array([row[0] for row in rows])
+        order = np.lexsort((times, sensors, [row[1] for row in rows]))  # node by node
+        times, sensors, rows = times[order], sensors[order], [rows[m] for m in order]
         kept = [row[5] for row in rows]
         hits, poses = (
             np.array([one.hits for one in kept]),
@@ -122,10 +125,8 @@ class TofFactor(Factor):
         )
         for one, hit, T in zip(kept, hits, poses, strict=True):
             one.hits, one.T_map_body = hit, T
-        sensors = np.array([row[0] for row in rows])
-        order = np.lexsort((times, sensors))
-        pairs = np.stack([order[:-1], order[1:]])  # of frames in a row of the same sensor
-        pairs = pairs[:, sensors[pairs[0]] == sensors[pairs[1]]]
+        first = np.flatnonzero(sensors[:-1] == sensors[1:])
+        pairs = np.stack([first, first + 1])  # of frames in a row of the same sensor
         arrays = (np.array([row[i] for row in rows]) for i in range(1, 5))
         return times, sensors, *arrays, hits, poses, pairs
 
@@ -169,14 +170,13 @@ class TofFactor(Factor):
         times, sensors, nodes, q, rays, variance, hits, _, _ = batch
         options = self.settings.tof
         weights = np.array([self.weights[self._names[s]] for s in sensors])
-        names, number = np.unique(sensors, return_inverse=True)
-        gradient, information = np.zeros(len(names)), np.zeros(len(names))
-        coupling = np.zeros((2 * self.grid.dim, len(names)))
+        gradient, information = np.zeros((2, len(self._names)))
+        coupling = np.zeros((2 * self.grid.dim, len(self._names)))
         _add_clocks(
             gradient,
             information,
             coupling,
-            number,
+            sensors,
             a.T,
             a.velocity,
             b.T,
@@ -195,8 +195,8 @@ class TofFactor(Factor):
             self.gate,
             hits,
         )
-        usual = np.ones(len(names))  # outliers the loss has taken care of
-        return ClockScores([self._names[s] for s in names], gradient, information, coupling, usual)
+        usual = np.ones(len(self._names))  # outliers the loss has taken care of
+        return ClockScores(self._names, gradient, information, coupling, usual)
 
     def _flicker(self, batch: tuple) -> dict[str, np.ndarray]:
         """Count by sensor zones seen in two frames in a row, and those matched in just one."""
@@ -305,14 +305,20 @@ def _add(
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
     index, work = np.empty(24, np.int64), np.empty((6, 24))
-    H_body, g_body = np.empty((6, 6)), np.empty(6)
+    H_body, g_body, H_node, g_node = (
+        np.empty((6, 6)),
+        np.empty(6),
+        np.zeros((24, 24)),
+        np.zeros(24),
+    )
     size = H.shape[0] // 2
-    cost, squared, count = 0.0, 0.0, 0
+    cost, squared, count, related = 0.0, 0.0, 0, -1
     for f in range(times.shape[0]):
         n = nodes[f]
-        gp.hermite(
-            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work
-        )
+        if n != related:  # frames of a node come after one another
+            gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
+            related = n
+        gp.evaluate(T_a[n], v_a[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
         if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
             associate(T, q[f], rays[f], variance[f], arrays, gate, min_cosine, hits[f])
             poses[f] = T
@@ -336,8 +342,10 @@ def _add(
             g_body,
             fits[f],
         )
-        gp.time_index(n, VELOCITY, size, index)
-        gp.add_local(H, g, index, H_body, g_body, J_pose, work)
+        gp.gather(H_node, g_node, H_body, g_body, J_pose, work)
+        if f + 1 == times.shape[0] or nodes[f + 1] != n:
+            gp.time_index(n, VELOCITY, size, index)
+            gp.scatter(H, g, index, H_node, g_node)
         cost += frame_cost
         squared += frame_squared
         count += frame_count
@@ -377,11 +385,13 @@ def _add_clocks(
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
     index, fit = np.empty(24, np.int64), np.empty(2)
     H, g, Hv = np.empty((6, 6)), np.empty(6), np.empty(6)
+    related = -1
     for f in range(times.shape[0]):
         n, s = nodes[f], sensors[f]
-        gp.hermite(
-            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work
-        )
+        if n != related:  # frames of a node come after one another
+            gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
+            related = n
+        gp.evaluate(T_a[n], v_a[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
         frame_information(
             T,
             q[f],
