@@ -21,6 +21,9 @@ from continuum_loc.measurements import (
 )
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
+from hypothesis import given
+from hypothesis import settings as budget
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from worlds import EPOCH, Rod, rod, room_map, stream
@@ -210,3 +213,76 @@ def test_unknown_sensors_are_refused_with_the_valid_names(name, message):
     factor = make_factor('gyro', description, Grid(description, 0.16))
     with pytest.raises(MeasurementError, match=message):
         factor.row(ImuSample(EPOCH, name, np.zeros(3), np.zeros(3)))
+
+
+def test_a_jerked_nodes_step_counts_less_and_others_as_before():
+    description = robot()
+    grid = Grid(description, 0.16)
+    priors = Priors(description, grid, EstimatorSettings())
+    a = column_at_rest(grid, np.eye(4), np.tile([1.0, 0, 0, 0, 0, 0], (grid.nodes, 1)), 0.0)
+    still, jerked = a.predict(DT), a.predict(DT)
+    # A change of velocity alone costs 4 / (q d) of its square; all 18 components share the loss.
+    sigma = np.sqrt(priors.velocity_psd[2, 0] * DT / 4.0)
+    jerked.velocity[2, 0] = 3.0 * np.sqrt(18.0) * sigma
+
+    def velocity_information(b):
+        blocks = Blocks.zeros(grid.dim)
+        priors.add(blocks, a, b)
+        at = [18 * n + 12 for n in range(grid.nodes)]
+        return blocks.H[at, at]  # the older column's, which the step alone informs
+
+    share = velocity_information(jerked) / velocity_information(still)
+    expected = np.ones(grid.nodes)
+    expected[2] = 1.0 / (1.0 + 9.0)
+    np.testing.assert_allclose(share, expected, rtol=1e-9)
+
+
+def gyro_at_rest(rates: np.ndarray, cauchy: float):
+    """Cost, slope by the first IMU's bias (3,), and its information, of a body that is still."""
+    description = robot()
+    grid = Grid(description, 0.16)
+    settings = parse_settings(EstimatorSettings, {'gyro': {'cauchy': cauchy}})
+    factor = next(f for f in FACTORS if f.name == 'gyro')(description, grid, settings)
+    R = description.imu[0].mount.T_ring_sensor[:3, :3]
+    rows = [
+        factor.row(ImuSample(EPOCH, description.imu[0].name, R.T @ rate, np.zeros(3)))
+        for rate in rates
+    ]
+    a = column_at_rest(grid, np.eye(4), np.tile([1.0, 0, 0, 0, 0, 0], (grid.nodes, 1)), 0.0)
+    blocks = Blocks.zeros(grid.dim)
+    batch = factor.stack(np.linspace(0.1, 0.9, len(rates)) * DT, rows)
+    report = factor.linearise(batch, a, a.predict(DT), blocks)
+    at = slice(grid.bias_offset, grid.bias_offset + 3)
+    return report.cost, blocks.g[at], blocks.H[at, at]
+
+
+def test_the_loss_of_a_gyro_is_the_integral_of_its_slope():
+    rates, step = np.random.default_rng(0).normal(scale=0.5, size=(9, 3)), 1e-6
+    _, slope, _ = gyro_at_rest(rates, 2.0)
+    for i in range(3):
+        shift = step * np.eye(3)[i]
+        ends = [gyro_at_rest(rates + sign * shift, 2.0)[0] for sign in (-1.0, 1.0)]
+        assert slope[i] == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=1e-5)
+
+
+@budget(max_examples=60, deadline=None)
+@given(
+    bursts=st.integers(1, 5),
+    quiet=st.integers(1, 5),
+    size=st.floats(0.1, 1.5),
+    cauchy=st.floats(0.5, 1e3),
+)
+def test_a_rattle_of_any_shape_keeps_its_mean_rate(bursts, quiet, size, cauchy):
+    # Rare fast turns one way, frequent slow ones back: their mean is none.
+    rates = np.zeros((bursts + quiet, 3))
+    rates[:bursts, 1], rates[bursts:, 1] = size * quiet, -size * bursts
+    _, slope, information = gyro_at_rest(rates, cauchy)
+    assert abs(slope[1] / information[1, 1]) < 1e-12 * size
+
+
+def test_a_gyro_that_rattles_says_less():
+    rattle = 0.3 * np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]] * 4)
+    calm = gyro_at_rest(0.0 * rattle, 10.0)[2][1, 1]
+    spread = 0.3**2 / (3.0 * (EstimatorSettings().gyro.scale * robot().imu_model.gyro_sigma) ** 2)
+    expected = 1.0 / (1.0 + spread / 10.0**2)
+    assert gyro_at_rest(rattle, 10.0)[2][1, 1] / calm == pytest.approx(expected, rel=1e-9)

@@ -189,6 +189,18 @@ def bridge(tau, d, out):
 
 
 @njit(cache=True)
+def motion_squared(e, d, q_inverse):
+    """Squared error e^T Q(d)^-1 (x) diag(q)^-1 e of `motion_error`'s e (12,)."""
+    a, b, c = 12.0 / d**3, -6.0 / d**2, 4.0 / d
+    squared = 0.0
+    for i in range(6):
+        squared += q_inverse[i] * (
+            a * e[i] * e[i] + 2.0 * b * e[i] * e[6 + i] + c * e[6 + i] * e[6 + i]
+        )
+    return squared
+
+
+@njit(cache=True)
 def add_motion(H, g, index, e, J, d, q_inverse):
     """
     Add the prior's normal equations to H, g at the 24 rows `index`; returns the squared error.
@@ -267,25 +279,25 @@ def gather(H_sum, g_sum, H_local, g_local, J, work):
 
 
 @njit(cache=True)
-def gather_rows(H_sum, g_sum, e, J, weight):
-    """Add weight |e + J x|^2 / 2 to H_sum (n, n), g_sum (n,), before one `scatter`."""
+def gather_rows(H_sum, g_sum, e, J):
+    """Add |e + J x|^2 / 2 to H_sum (n, n), g_sum (n,), before one `scatter`."""
     for i in range(e.shape[0]):
         for j in range(J.shape[1]):
-            scaled = weight * J[i, j]
-            g_sum[j] += scaled * e[i]
+            slope = J[i, j]
+            g_sum[j] += slope * e[i]
             for k in range(J.shape[1]):
-                H_sum[j, k] += scaled * J[i, k]
+                H_sum[j, k] += slope * J[i, k]
 
 
 @njit(cache=True)
-def scatter(H, g, index, H_sum, g_sum):
-    """Add H_sum (n, n), g_sum (n,) to H, g at the rows `index`, and clear them."""
+def scatter(H, g, index, H_sum, g_sum, weight):
+    """Add weight H_sum (n, n), weight g_sum (n,) to H, g at the rows `index`, and clear them."""
     n = index.shape[0]
     for j in range(n):
-        g[index[j]] += g_sum[j]
+        g[index[j]] += weight * g_sum[j]
         g_sum[j] = 0.0
         for k in range(n):
-            H[index[j], index[k]] += H_sum[j, k]
+            H[index[j], index[k]] += weight * H_sum[j, k]
             H_sum[j, k] = 0.0
 
 

@@ -34,7 +34,7 @@ class Priors:
     def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
         prior = settings.prior
         self.grid = grid
-        self.memory = prior.memory
+        self.memory, self.cauchy = prior.memory, prior.cauchy
         self.s = grid.s
         self.rest = np.array(robot.backbone.rest_strain)
         self.rest_information = 1.0 / np.square(robot.backbone.rest_strain_sigma)
@@ -87,7 +87,7 @@ class Priors:
     def add(self, blocks: Blocks, a: Column, b: Column) -> None:
         """Add the interval's time prior and the newer column's own factors; the cost too."""
         dt, D = b.time - a.time, self.grid.dim
-        squared = _add_time(
+        cost = _add_time(
             blocks.H,
             blocks.g,
             a.T,
@@ -99,10 +99,11 @@ class Priors:
             dt,
             self.velocity,
             self.strain_rate,
+            self.cauchy,
         )
         _add_bias(blocks.H, blocks.g, a.bias, b.bias, self.bias_rate / dt, self.grid.bias_offset)
-        squared += self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
-        blocks.cost += 0.5 * squared
+        own = self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
+        blocks.cost += cost + 0.5 * own
 
     def _add_column(self, H: np.ndarray, g: np.ndarray, column: Column, share: float) -> float:
         """
@@ -136,29 +137,42 @@ class Priors:
 
 @njit(cache=True)
 def _add_time(
-    H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, strain_information
+    H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, strain_information, cauchy
 ):
+    """
+    Add each node's step from knot to knot, under a Cauchy loss; returns the robust cost.
+
+    The noise of a step is a heavy-tailed one that all components of a node share: its variance is
+    the settings' for a body that moves as usual, and grows where it is jerked.
+    """
     W, V, M = lie_kernels.workspace()
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
+    information, walk = np.empty(6), np.empty(6)
     size = H.shape[0] // 2
-    squared = 0.0
+    cost, c2 = 0.0, NODE_DIM * cauchy * cauchy
     for n in range(T_a.shape[0]):
         gp.motion_error(T_a[n], v_a[n], T_b[n], v_b[n], dt, e, J, W, V, M)
+        squared = gp.motion_squared(e, dt, velocity_information[n])
+        for i in range(6):
+            walk[i] = eps_b[n, i] - eps_a[n, i]
+            squared += strain_information[i] / dt * walk[i] * walk[i]
+        robust = 1.0 / (1.0 + squared / c2)
+        cost += 0.5 * c2 * np.log1p(squared / c2)
+        for i in range(6):
+            information[i] = robust * velocity_information[n, i]
         gp.time_index(n, VELOCITY, size, index)
-        squared += gp.add_motion(H, g, index, e, J, dt, velocity_information[n])
+        gp.add_motion(H, g, index, e, J, dt, information)
         for i in range(6):
             older = NODE_DIM * n + STRAIN + i
             newer = older + size
-            weight = strain_information[i] / dt
-            change = eps_b[n, i] - eps_a[n, i]
-            squared += weight * change * change
+            weight = robust * strain_information[i] / dt
             H[older, older] += weight
             H[newer, newer] += weight
             H[older, newer] -= weight
             H[newer, older] -= weight
-            g[older] -= weight * change
-            g[newer] += weight * change
-    return squared
+            g[older] -= weight * walk[i]
+            g[newer] += weight * walk[i]
+    return cost
 
 
 @njit(cache=True)

@@ -47,6 +47,13 @@ class PriorSettings(Settings):
     initial_velocity_sigma: tuple[float, float] = Field(
         (0.05, 0.1), description='spread of the velocity at the first instant [m/s, rad/s]'
     )
+    cauchy: float = Field(
+        1.0,
+        gt=0.0,
+        description="scale of the Cauchy loss on a node's step from knot to knot, in sigmas (root "
+        'mean square of its components): a brisk motion gets more process noise by itself; large '
+        'switches it off',
+    )
     memory: float = Field(
         1.0,
         gt=0.0,
@@ -97,8 +104,8 @@ class GyroSettings(Settings):
     cauchy: float = Field(
         100.0,
         gt=0.0,
-        description='scale of the Cauchy loss in sigmas: wide, as a body that rattles '
-        'faster than the knots must keep its mean rate',
+        description="scale of the Cauchy loss on an IMU's samples between two knots, in sigmas "
+        '(their root mean square): wide, as rattling faster than the knots is no outlier',
     )
     bias_sigma: float = Field(0.02, gt=0.0, description='spread of the bias at start [rad/s]')
     bias_walk: float = Field(1e-4, gt=0.0, description='random walk of the bias [rad/s/sqrt(s)]')

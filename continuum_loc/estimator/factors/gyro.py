@@ -158,36 +158,48 @@ def _add(
     bias_offset,
     residuals,
 ):
+    """
+    Add the samples; returns the robust cost and the sum of weighted squared residuals.
+
+    The Cauchy loss is on all samples of an IMU at once: where the body moves faster than a cubic
+    between two knots can, their residuals are no white noise of the gyro, and all of them count
+    less. A loss on each sample would take the largest rates for outliers and bias their mean.
+    """
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
     J, index, e = np.zeros((3, 27)), np.empty(27, np.int64), np.empty(3)
     H_imu, g_imu = np.zeros((27, 27)), np.zeros(27)
-    size = H.shape[0] // 2
+    size, c2 = H.shape[0] // 2, cauchy * cauchy
     cost, squared, related = 0.0, 0.0, -1
+    misfit, samples = 0.0, 0
+    for i in range(3):
+        J[i, 24 + i] = 1.0
     for m in range(times.shape[0]):
-        n = nodes[m]
+        n, imu = nodes[m], imus[m]
         if n != related:  # samples of an IMU come after one another
             gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
             related = n
         gp.evaluate(T_a[n], v_a[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
-        u2 = 0.0
         for i in range(3):
-            e[i] = v[3 + i] + bias[imus[m], i] - omega[m, i]
-            u2 += weight * e[i] * e[i]
+            e[i] = v[3 + i] + bias[imu, i] - omega[m, i]
+            misfit += weight * e[i] * e[i]
             for j in range(24):
                 J[i, j] = J_rate[3 + i, j]
-            J[i, 24 + i] = 1.0
-        robust = 1.0 / (1.0 + u2 / (cauchy * cauchy))
-        gp.gather_rows(H_imu, g_imu, e, J, shares[imus[m]] * weight * robust)
-        if m + 1 == times.shape[0] or imus[m + 1] != imus[m]:
-            gp.time_index(n, VELOCITY, size, index)
-            for i in range(3):
-                index[24 + i] = bias_offset + 3 * imus[m] + i
-            gp.scatter(H, g, index, H_imu, g_imu)
+        gp.gather_rows(H_imu, g_imu, e, J)
         residuals[m] = e
-        cost += 0.5 * shares[imus[m]] * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
-        squared += u2 * robust
+        samples += 1
+        if m + 1 < times.shape[0] and imus[m + 1] == imu:
+            continue
+        spread = misfit / (3.0 * samples)
+        robust = 1.0 / (1.0 + spread / c2)
+        cost += 0.5 * shares[imu] * 3.0 * samples * c2 * np.log1p(spread / c2)
+        squared += misfit * robust
+        gp.time_index(n, VELOCITY, size, index)
+        for i in range(3):
+            index[24 + i] = bias_offset + 3 * imu + i
+        gp.scatter(H, g, index, H_imu, g_imu, shares[imu] * weight * robust)
+        misfit, samples = 0.0, 0
     return cost, squared
 
 

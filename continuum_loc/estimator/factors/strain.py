@@ -176,5 +176,5 @@ def _add(
                 index[24 * half + 6 + i] = start + STRAIN + i
                 index[24 * half + 12 + i] = start + NODE_DIM + i
                 index[24 * half + 18 + i] = start + NODE_DIM + STRAIN + i
-        gp.scatter(H, g, index, H_segment, g_segment)
+        gp.scatter(H, g, index, H_segment, g_segment, 1.0)
     return cost, squared

@@ -345,7 +345,7 @@ def _add(
         gp.gather(H_node, g_node, H_body, g_body, J_pose, work)
         if f + 1 == times.shape[0] or nodes[f + 1] != n:
             gp.time_index(n, VELOCITY, size, index)
-            gp.scatter(H, g, index, H_node, g_node)
+            gp.scatter(H, g, index, H_node, g_node, 1.0)
         cost += frame_cost
         squared += frame_squared
         count += frame_count
