@@ -215,7 +215,8 @@ def test_unknown_sensors_are_refused_with_the_valid_names(name, message):
         factor.row(ImuSample(EPOCH, name, np.zeros(3), np.zeros(3)))
 
 
-def test_a_jerked_nodes_step_counts_less_and_others_as_before():
+@pytest.mark.parametrize('sigmas, expected', [(3.0, 1.0 / (1.0 + 9.0)), (30.0, 1.0 / 20.0)])
+def test_a_jerked_nodes_step_counts_less_to_a_limit_and_others_as_before(sigmas, expected):
     description = robot()
     grid = Grid(description, 0.16)
     priors = Priors(description, grid, EstimatorSettings())
@@ -223,7 +224,7 @@ def test_a_jerked_nodes_step_counts_less_and_others_as_before():
     still, jerked = a.predict(DT), a.predict(DT)
     # A change of velocity alone costs 4 / (q d) of its square; all 18 components share the loss.
     sigma = np.sqrt(priors.velocity_psd[2, 0] * DT / 4.0)
-    jerked.velocity[2, 0] = 3.0 * np.sqrt(18.0) * sigma
+    jerked.velocity[2, 0] = sigmas * np.sqrt(18.0) * sigma
 
     def velocity_information(b):
         blocks = Blocks.zeros(grid.dim)
@@ -232,9 +233,9 @@ def test_a_jerked_nodes_step_counts_less_and_others_as_before():
         return blocks.H[at, at]  # the older column's, which the step alone informs
 
     share = velocity_information(jerked) / velocity_information(still)
-    expected = np.ones(grid.nodes)
-    expected[2] = 1.0 / (1.0 + 9.0)
-    np.testing.assert_allclose(share, expected, rtol=1e-9)
+    others = np.ones(grid.nodes)
+    others[2] = expected
+    np.testing.assert_allclose(share, others, rtol=1e-9)
 
 
 def gyro_at_rest(rates: np.ndarray, cauchy: float):

@@ -34,7 +34,7 @@ class Priors:
     def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
         prior = settings.prior
         self.grid = grid
-        self.memory, self.cauchy = prior.memory, prior.cauchy
+        self.memory, self.cauchy, self.jerked = prior.memory, prior.cauchy, prior.jerked
         self.s = grid.s
         self.rest = np.array(robot.backbone.rest_strain)
         self.rest_information = 1.0 / np.square(robot.backbone.rest_strain_sigma)
@@ -100,6 +100,7 @@ class Priors:
             self.velocity,
             self.strain_rate,
             self.cauchy,
+            1.0 / self.jerked,
         )
         _add_bias(blocks.H, blocks.g, a.bias, b.bias, self.bias_rate / dt, self.grid.bias_offset)
         own = self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
@@ -137,13 +138,25 @@ class Priors:
 
 @njit(cache=True)
 def _add_time(
-    H, g, T_a, v_a, eps_a, T_b, v_b, eps_b, dt, velocity_information, strain_information, cauchy
+    H,
+    g,
+    T_a,
+    v_a,
+    eps_a,
+    T_b,
+    v_b,
+    eps_b,
+    dt,
+    velocity_information,
+    strain_information,
+    cauchy,
+    least,
 ):
     """
     Add each node's step from knot to knot, under a Cauchy loss; returns the robust cost.
 
     The noise of a step is a heavy-tailed one that all components of a node share: its variance is
-    the settings' for a body that moves as usual, and grows where it is jerked.
+    the settings' for a body that moves as usual, and grows where it is jerked, up to 1 / least.
     """
     W, V, M = lie_kernels.workspace()
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
@@ -156,8 +169,9 @@ def _add_time(
         for i in range(6):
             walk[i] = eps_b[n, i] - eps_a[n, i]
             squared += strain_information[i] / dt * walk[i] * walk[i]
-        robust = 1.0 / (1.0 + squared / c2)
-        cost += 0.5 * c2 * np.log1p(squared / c2)
+        robust = max(1.0 / (1.0 + squared / c2), least)
+        lossy = min(squared, c2 * (1.0 / least - 1.0))  # beyond it the loss is a square again
+        cost += 0.5 * (c2 * np.log1p(lossy / c2) + least * (squared - lossy))
         for i in range(6):
             information[i] = robust * velocity_information[n, i]
         gp.time_index(n, VELOCITY, size, index)

@@ -54,6 +54,9 @@ class PriorSettings(Settings):
         'mean square of its components): a brisk motion gets more process noise by itself; large '
         'switches it off',
     )
+    jerked: float = Field(
+        20.0, ge=1.0, description='most that a jerk multiplies the process noise of a step by'
+    )
     memory: float = Field(
         1.0,
         gt=0.0,
@@ -102,10 +105,10 @@ class GyroSettings(Settings):
     enabled: bool = True
     scale: float = Field(1.5, gt=0.0, description="factor on the datasheet's noise")
     cauchy: float = Field(
-        100.0,
+        10.0,
         gt=0.0,
         description="scale of the Cauchy loss on an IMU's samples between two knots, in sigmas "
-        '(their root mean square): wide, as rattling faster than the knots is no outlier',
+        '(their root mean square): they count less where the body rattles faster than the knots',
     )
     bias_sigma: float = Field(0.02, gt=0.0, description='spread of the bias at start [rad/s]')
     bias_walk: float = Field(1e-4, gt=0.0, description='random walk of the bias [rad/s/sqrt(s)]')

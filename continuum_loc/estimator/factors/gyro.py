@@ -168,7 +168,7 @@ def _add(
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
     T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
-    J, index, e = np.zeros((3, 27)), np.empty(27, np.int64), np.empty(3)
+    J, index = np.zeros((3, 27)), np.empty(27, np.int64)
     H_imu, g_imu = np.zeros((27, 27)), np.zeros(27)
     size, c2 = H.shape[0] // 2, cauchy * cauchy
     cost, squared, related = 0.0, 0.0, -1
@@ -182,12 +182,11 @@ def _add(
             related = n
         gp.evaluate(T_a[n], v_a[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
         for i in range(3):
-            e[i] = v[3 + i] + bias[imu, i] - omega[m, i]
-            misfit += weight * e[i] * e[i]
+            residuals[m, i] = v[3 + i] + bias[imu, i] - omega[m, i]
+            misfit += weight * residuals[m, i] * residuals[m, i]
             for j in range(24):
                 J[i, j] = J_rate[3 + i, j]
-        gp.gather_rows(H_imu, g_imu, e, J)
-        residuals[m] = e
+        gp.gather_rows(H_imu, g_imu, residuals[m], J)
         samples += 1
         if m + 1 < times.shape[0] and imus[m + 1] == imu:
             continue
