@@ -352,3 +352,23 @@ def test_a_window_restored_knows_what_it_knew(prior_map):
         np.trace(covariance, axis1=1, axis2=2),
         rtol=0.02,
     )
+
+
+def test_cycles_split_by_late_clocks_are_whole_again_after(prior_map):
+    """The next outputs wait again for every sensor of their instant."""
+    robot = rod()
+    samples = [s for s in stream(Rod(robot), 2.0) if not isinstance(s, TruthSample)]
+    late = {sensor.name for sensor in robot.tof[len(robot.tof) // 2 :]}
+    filter_, heard, whole = SlidingWindowFilter(robot, prior_map, settings()), {}, []
+    for sample in samples:
+        time = (sample.stamp - EPOCH) * 1e-9
+        if isinstance(sample, TofFrame):
+            heard.setdefault(sample.stamp, set()).add(sample.sensor)
+            if sample.sensor in late and 0.7 < time < 1.2:
+                sample = replace(sample, stamp=sample.stamp + 50_000_000)
+        estimate = filter_.process(sample)
+        if estimate is not None:
+            whole.append((time, len(heard.get(estimate.stamp, ())) == len(robot.tof)))
+    assert all(is_whole for time, is_whole in whole if time < 0.7)
+    assert not all(is_whole for time, is_whole in whole if 0.7 < time < 1.2)
+    assert all(is_whole for time, is_whole in whole if time > 1.3)

@@ -222,6 +222,11 @@ class SlidingWindowFilter:
         self._cycle_start = self._cycle_start or measurement.stamp
         if self.tof is None or not isinstance(measurement, TofFrame):
             return False
+        if not self._cycle and measurement.stamp <= self._output:
+            # A straggler of what was put out begins no cycle, which would be split as that one
+            # was and lack its sensors for ever; the next one waits for it.
+            self._last_cycle.add(measurement.sensor)
+            return False
         self._cycle.add(measurement.sensor)
         self._cycle_stamp = max(self._cycle_stamp, measurement.stamp)
         return (
