@@ -12,7 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from continuum_loc.evaluation.campaign import Outcome
-from continuum_loc.evaluation.report import context_of, Page, Part, render, Row, run_page, Table
+from continuum_loc.evaluation.report import (
+    context_of,
+    number,
+    Page,
+    Part,
+    render,
+    Row,
+    run_page,
+    Table,
+)
 from continuum_loc.evaluation.runs import load_run
 from continuum_loc.evaluation.study import Claim
 
@@ -71,7 +80,8 @@ def with_worst_trial(page: Page, out: Path, ranked: Sequence[Outcome]) -> Page:
         return page
     run = load_run(out / 'trials' / ranked[0].trial.name)
     worst = run_page(run, context_of(run))
-    head = Part(f'The worst trial: {worst.title}', worst.subtitle)
+    judged = ranked[0].summary['translation_mae_m'] is not None
+    head = Part(f'{"The worst trial" if judged else "One trial"}: {worst.title}', worst.subtitle)
     return replace(
         page, groups=[*page.groups, [head], *worst.groups], configuration=worst.configuration
     )
@@ -98,14 +108,14 @@ def claims_part(claims: Sequence[Claim]) -> Part:
 
 
 def worst_part(ranked: Sequence[Outcome]) -> Part:
-    """Show the trials with the greatest mean error, the worst first."""
+    """Show the trials with the greatest mean error, the worst first; without truth, last."""
     rows = [
         Row(
             [
                 one.trial.name,
-                f'{100 * one.summary["translation_mae_m"]:.2f}',
-                f'{100 * one.summary["translation_max_m"]:.2f}',
-                f'{one.summary["rotation_mae_deg"]:.2f}',
+                number(one.summary['translation_mae_m'], 100),
+                number(one.summary['translation_max_m'], 100),
+                number(one.summary['rotation_mae_deg']),
                 f'{one.summary["estimates"]["lost"]} of {one.summary["estimates"]["all"]}',
             ]
         )
