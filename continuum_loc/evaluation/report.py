@@ -354,7 +354,7 @@ def _error_groups(run: Run, found: Errors, epoch: int) -> Iterator[list[Part]]:
     judged = associate(settled(run.result.track), run.result.truth)[0]
     lost = judged.status == 'lost' if judged.status is not None else np.zeros(len(found), bool)
     shade = (
-        'Grey: three standard deviations as the filter states them. '
+        'Grey: three standard deviations as the filter states them, rare peaks cut off. '
         'Yellow: the filter says that it is lost.'
     )
     yield [
@@ -372,7 +372,8 @@ def _error_groups(run: Run, found: Errors, epoch: int) -> Iterator[list[Part]]:
     yield [
         Part(
             'Error by component',
-            "In the ring's own frame, x along the backbone, with plus and minus 3 sigma.",
+            "In the ring's own frame, x along the backbone, with plus and minus 3 sigma, "
+            'rare peaks cut off.',
             figure=chart(figures.component_figure(found, epoch)),
         )
     ]

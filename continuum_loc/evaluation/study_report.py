@@ -93,18 +93,14 @@ def claims_part(claims: Sequence[Claim]) -> Part:
         Row(
             [
                 claim.name,
-                f'{claim.value:.4g}',
-                claim.unit,
-                claim.bound,
+                f'{claim.value:.4g} {claim.unit}'.strip().replace(' ', '\u00a0'),
+                claim.bound.replace('<=', '≤').replace('>=', '≥').replace(' ', '\u00a0'),
                 'yes' if claim.holds else 'no',
             ]
         )
         for claim in sorted(claims, key=lambda claim: claim.holds)
     ]
-    return Part(
-        'Claims',
-        table=Table(['claim', 'value', 'unit', 'bound', 'holds'], rows, words=(0, 2, 3, 4)),
-    )
+    return Part('Claims', table=Table(['claim', 'value', 'bound', 'holds'], rows, words=(0, 2, 3)))
 
 
 def worst_part(ranked: Sequence[Outcome]) -> Part:
