@@ -4,11 +4,14 @@ Reconstruction and anomalies.
 Covariance against Monte Carlo, detection in rooms whose differences are known.
 """
 
+from dataclasses import replace
+
 from continuum_loc import lie
 from continuum_loc.mapping.anomalies import (
     AnomalyCluster,
     AnomalySettings,
     Beams,
+    beams_on,
     clusters,
     detect_anomalies,
     Evidence,
@@ -26,6 +29,7 @@ from continuum_loc.mapping.fuse import fuse
 from continuum_loc.mapping.reconstruct import (
     distances_to_mesh,
     reconstruct,
+    Reconstruction,
     RingTrajectory,
     root_mean_square,
 )
@@ -246,6 +250,28 @@ def test_new_and_missing_things_are_found_and_nothing_else(changed_room):
     np.testing.assert_array_equal(result.recall, 1.0)
     for cluster in detected:
         assert 0.05 < cluster.size < 0.2
+
+
+def test_beams_that_end_beside_a_thing_do_not_show_it():
+    tile = placed(trimesh.creation.box((0.1, 0.1, 0.01)), 0, 0, 0.005)
+    truth = Truth('added', tile.vertices, tile.faces)
+    ends = np.array([[0.0, 0.0, 0.01], [0.03, 0.0, 0.012], [0.055, 0.0, 0.0], [0.0, 0.0, 0.3]])
+    count = len(ends)
+    cloud = Reconstruction(
+        ends,
+        np.tile(np.eye(3) * 1e-6, (count, 1, 1)),
+        np.full(count, 0.001),
+        np.column_stack([ends[:, :2], np.full(count, 0.5)]),
+        np.arange(count),
+        np.zeros(count, int),
+        ('tof',),
+        np.empty((0, 3)),
+        np.empty((0, 3)),
+    )
+    # The third ends on the floor 5 mm beside it, the fourth on something before it.
+    assert beams_on(truth, cloud) == 2
+    cloud = replace(cloud, points=ends - [0.0, 0.0, 0.05])
+    assert beams_on(truth._replace(kind='missing'), cloud) == 2  # those that go through
 
 
 def test_an_unchanged_room_has_no_anomalies():

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import get_args, Literal, NamedTuple
 
 from continuum_loc.mapping.build import DENSITY
 from continuum_loc.mapping.errors import MapError
@@ -40,6 +40,7 @@ import numpy as np
 from pydantic import Field
 
 Kind = Literal['added', 'missing']
+CLEARLY = 0.02  # m: more than a range errs by
 PARALLELS = 6  # lines round a beam along which the map is looked at
 
 
@@ -503,27 +504,26 @@ def seen(
 
     Needs a reconstruction from the true poses: it says what could have been detected.
     """
-    return [one for one in truth if _beams_on(one, reconstruction) >= least_beams]
+    return [one for one in truth if beams_on(one, reconstruction) >= least_beams]
 
 
-def _beams_on(truth: Truth, reconstruction: Reconstruction) -> int:
-    if truth.kind == 'added':
-        return int(_near_solid(reconstruction.points, truth, 0.01).sum())
-    if truth.kind != 'missing':
+def beams_on(truth: Truth, reconstruction: Reconstruction) -> int:
+    """
+    Count the beams that met a true anomaly.
+
+    Only those whose line meets its surface: beams that end on the wall close beside a thing do
+    not show it.
+    """
+    if truth.kind not in get_args(Kind):
         raise MapError(f"an anomaly is added or missing, not '{truth.kind}'")
     import open3d
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(np.asarray(truth.vertices, np.float32), np.asarray(truth.faces, np.uint32))
-    rays = np.concatenate(
-        [reconstruction.origins, reconstruction.points - reconstruction.origins], axis=1
-    )
-    depth = scene.cast_rays(rays.astype(np.float32), nthreads=1)[
-        't_hit'
-    ].numpy()  # in units of the beam's length
-    return int(
-        (
-            depth * np.linalg.norm(rays[:, 3:], axis=1)
-            < np.linalg.norm(rays[:, 3:], axis=1) - 0.02
-        ).sum()
-    )
+    along = reconstruction.points - reconstruction.origins
+    length = np.linalg.norm(along, axis=1)
+    rays = np.concatenate([reconstruction.origins, along / length[:, None]], axis=1)
+    depth = scene.cast_rays(rays.astype(np.float32), nthreads=1)['t_hit'].numpy()
+    # What is beyond a range's error: it stopped at something else before, or went on behind.
+    reached = length > depth + (CLEARLY if truth.kind == 'missing' else -CLEARLY)
+    return int(np.count_nonzero(np.isfinite(depth) & reached))
