@@ -346,6 +346,15 @@ def test_what_an_edge_of_the_map_explains_is_no_anomaly(kind, x, length, explain
     assert share < 0.1 if explained else share > 0.97**7 - 0.15
 
 
+def test_a_small_cluster_needs_many_beams():
+    def found(beams, width):
+        places = np.random.default_rng(8).uniform(0, width, (beams, 3))
+        agreed = Evidence(places, np.ones(beams, bool), np.arange(beams), np.arange(beams))
+        return len(clusters(agreed, 'missing', AnomalySettings(cell=0.1)))
+
+    assert [found(49, 0.02), found(50, 0.02), found(49, 0.04)] == [0, 1, 1]
+
+
 def test_wilson_bound_covers_the_true_share_as_often_as_it_says():
     """
     One-sided 95 %: the bound exceeds the truth in about 5 % of 4000 draws.

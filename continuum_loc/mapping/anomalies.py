@@ -76,7 +76,15 @@ class AnomalySettings(Settings):
     )
     min_beams: int = Field(10, ge=1, description='disagreeing beams that a cluster needs')
     min_size: float = Field(
-        0.025, ge=0.0, description='extent that a cluster needs [m]: map edges fray by less'
+        0.025,
+        ge=0.0,
+        description='extent that a cluster of few beams needs [m]: map edges fray by less',
+    )
+    many_beams: int = Field(
+        50,
+        ge=1,
+        description='disagreeing beams from which extent does not matter: that of missing things '
+        'is known to the spacing of the map alone',
     )
     disc: float = Field(
         0.6,
@@ -395,7 +403,8 @@ def _cluster(
     if len(against) < settings.min_beams or frames < settings.min_frames:
         return None
     points = evidence.places[against]
-    if np.ptp(points, axis=0).max() < settings.min_size:
+    small = np.ptp(points, axis=0).max() < settings.min_size
+    if small and len(against) < settings.many_beams:
         return None
     return AnomalyCluster(
         kind,
