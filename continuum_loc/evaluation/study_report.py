@@ -132,12 +132,18 @@ def unbroken(value: Any) -> str:
     return str(value).replace(' ± ', '\u00a0±\u00a0').replace(' - ', '\u00a0-\u00a0')
 
 
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 def as_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Rows of mappings with equal keys as a table of the page."""
     columns = list(rows[0]) if rows else []
-    words = [
-        index for index, name in enumerate(columns) if rows and isinstance(rows[0][name], str)
-    ]
+    words = [index for index, name in enumerate(columns) if rows and not _is_number(rows[0][name])]
     return Table(
         columns,
         [Row([unbroken(row[name]) for name in columns]) for row in rows],
