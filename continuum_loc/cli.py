@@ -9,6 +9,7 @@ Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
@@ -401,8 +402,18 @@ def evaluate(
         else _evaluate_bags(folder, robot, map_file, settings, out, jobs)
     )
     console.print(_claims_table(claims))
+    for trial, error in _failed(out, name).items():
+        errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _failed(out: Path, name: str) -> dict[str, str]:
+    """Read the trials that a study lost, and why; some write to a folder of their name."""
+    for summary in (out / name / 'summary.json', out / 'summary.json'):
+        if summary.is_file():
+            return json.loads(summary.read_text()).get('failed', {})
+    return {}
 
 
 def _evaluate_bags(

@@ -4,9 +4,14 @@ Reconstruction and anomalies.
 Covariance against Monte Carlo, detection in rooms whose differences are known.
 """
 
+from dataclasses import replace
+
 from continuum_loc import lie
 from continuum_loc.mapping.anomalies import (
+    AnomalyCluster,
     AnomalySettings,
+    Beams,
+    beams_on,
     clusters,
     detect_anomalies,
     Evidence,
@@ -14,6 +19,7 @@ from continuum_loc.mapping.anomalies import (
     precision_recall,
     seen,
     Truth,
+    unexplained_share,
     wilson_lower_bound,
 )
 from continuum_loc.mapping.build import sample_mesh
@@ -23,6 +29,7 @@ from continuum_loc.mapping.fuse import fuse
 from continuum_loc.mapping.reconstruct import (
     distances_to_mesh,
     reconstruct,
+    Reconstruction,
     RingTrajectory,
     root_mean_square,
 )
@@ -245,6 +252,28 @@ def test_new_and_missing_things_are_found_and_nothing_else(changed_room):
         assert 0.05 < cluster.size < 0.2
 
 
+def test_beams_that_end_beside_a_thing_do_not_show_it():
+    tile = placed(trimesh.creation.box((0.1, 0.1, 0.01)), 0, 0, 0.005)
+    truth = Truth('added', tile.vertices, tile.faces)
+    ends = np.array([[0.0, 0.0, 0.01], [0.03, 0.0, 0.012], [0.055, 0.0, 0.0], [0.0, 0.0, 0.3]])
+    count = len(ends)
+    cloud = Reconstruction(
+        ends,
+        np.tile(np.eye(3) * 1e-6, (count, 1, 1)),
+        np.full(count, 0.001),
+        np.column_stack([ends[:, :2], np.full(count, 0.5)]),
+        np.arange(count),
+        np.zeros(count, int),
+        ('tof',),
+        np.empty((0, 3)),
+        np.empty((0, 3)),
+    )
+    # The third ends on the floor 5 mm beside it, the fourth on something before it.
+    assert beams_on(truth, cloud) == 2
+    cloud = replace(cloud, points=ends - [0.0, 0.0, 0.05])
+    assert beams_on(truth._replace(kind='missing'), cloud) == 2  # those that go through
+
+
 def test_an_unchanged_room_has_no_anomalies():
     trajectory, mesh = swaying(), room(COMMON)
     prior = sample_mesh(mesh.vertices, mesh.faces, spacing=0.005)
@@ -271,12 +300,59 @@ def test_points_on_the_map_pass_the_chi2_test_at_its_level():
 def test_witnesses_to_the_contrary_lower_the_confidence():
     rng = np.random.default_rng(6)
     places, stamps = rng.uniform(0, 0.03, (60, 3)), np.arange(60)
-    alone = clusters(Evidence(places, np.ones(60, bool), stamps), 'added', WIDE)
-    disputed = clusters(Evidence(places, np.arange(60) % 3 > 0, stamps), 'added', WIDE)
-    denied = clusters(Evidence(places, np.arange(60) % 3 == 0, stamps), 'added', WIDE)
+    alone = clusters(Evidence(places, np.ones(60, bool), stamps, np.arange(60)), 'added', WIDE)
+    disputed = clusters(
+        Evidence(places, np.arange(60) % 3 > 0, stamps, np.arange(60)), 'added', WIDE
+    )
+    denied = clusters(
+        Evidence(places, np.arange(60) % 3 == 0, stamps, np.arange(60)), 'added', WIDE
+    )
     assert alone[0].confidence > 0.9 > disputed[0].confidence > 0.4 and denied == []
-    one_frame = clusters(Evidence(places, np.ones(60, bool), np.zeros(60)), 'added', WIDE)
+    one_frame = clusters(
+        Evidence(places, np.ones(60, bool), np.zeros(60), np.arange(60)), 'added', WIDE
+    )
     assert one_frame == []
+
+
+@pytest.mark.parametrize(
+    ('kind', 'x', 'length', 'explained'),
+    [
+        ('missing', 0.0, 0.795, False),  # through the middle of a plate, to the wall behind it
+        ('missing', 0.105, 0.795, True),  # past its edge, which the discs overhang
+        ('added', 0.0, 0.3, False),  # ends in mid-air
+        ('added', 0.105, 0.495, True),  # at the height of the plate, where it might not have ended
+        ('added', 0.14, 0.495, False),  # too far beside it for that
+    ],
+)
+def test_what_an_edge_of_the_map_explains_is_no_anomaly(kind, x, length, explained):
+    plate = placed(trimesh.creation.box((0.2, 0.2, 0.01)), 0, 0, 0)
+    wall = placed(trimesh.creation.box((1.0, 1.0, 0.01)), 0, 0, -0.3)
+    mesh = trimesh.util.concatenate([plate, wall])
+    prior = sample_mesh(mesh.vertices, mesh.faces, spacing=0.02, seed=1)
+    count = 20
+    beams = Beams(
+        np.column_stack([np.full(count, x), np.linspace(-0.05, 0.05, count), np.full(count, 0.5)]),
+        np.tile([0.0, 0.0, -1.0], (count, 1)),
+        np.full(count, length),
+        np.full(count, 0.001),
+        np.arange(count),
+    )
+    cluster = AnomalyCluster(
+        kind, np.zeros((count, 3)), np.zeros(3), np.zeros(3), count, count, 1.0, np.arange(count)
+    )
+    settings = AnomalySettings()
+    share = unexplained_share(cluster, beams, prior, settings, prior.index())
+    # Discs leave holes of 3 %, and one in any of a beam's seven lines explains it.
+    assert share < 0.1 if explained else share > 0.97**7 - 0.15
+
+
+def test_a_small_cluster_needs_many_beams():
+    def found(beams, width):
+        places = np.random.default_rng(8).uniform(0, width, (beams, 3))
+        agreed = Evidence(places, np.ones(beams, bool), np.arange(beams), np.arange(beams))
+        return len(clusters(agreed, 'missing', AnomalySettings(cell=0.1)))
+
+    assert [found(49, 0.02), found(50, 0.02), found(49, 0.04)] == [0, 1, 1]
 
 
 def test_wilson_bound_covers_the_true_share_as_often_as_it_says():

@@ -7,7 +7,7 @@ It loses no peak on the way to a picture.
 from dataclasses import replace
 import re
 
-from continuum_loc.evaluation.figures import spans, thin
+from continuum_loc.evaluation.figures import ceiling, spans, thin
 from continuum_loc.evaluation.metrics import errors
 from continuum_loc.evaluation.replay import replay
 from continuum_loc.evaluation.report import Context, run_page, worst_moments, write_report
@@ -198,3 +198,12 @@ def test_a_table_read_back_is_the_table(tmp_path):
     write_table(rows, tmp_path / 't')
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / 't.csv'), pd.DataFrame(rows))
     assert {path.suffix for path in tmp_path.iterdir()} == {'.csv', '.json', '.md', '.tex'}
+
+
+def test_a_rare_peak_of_the_band_does_not_hide_the_errors():
+    values, band = np.full(200, 0.1), np.full(200, 0.3)
+    band[77] = 8.0
+    assert ceiling(values, band) == pytest.approx(0.33)
+    values[5] = 1.0  # an error is never cut off
+    assert ceiling(values, band) == pytest.approx(1.1)
+    assert ceiling(values, np.full(200, np.nan)) == pytest.approx(1.1)

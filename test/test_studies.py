@@ -7,6 +7,7 @@ Benchmarks and tuning judge as they say.
 from dataclasses import replace
 import json
 import math
+import shutil
 
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.evaluation import campaign
@@ -88,6 +89,33 @@ def test_other_settings_are_estimated_anew(done):
     out, trials, before = done
     other = run_campaign(trials[:1], out, settings=EstimatorSettings(window=0.5))
     assert other[0].summary['configuration_digest'] != before[0].summary['configuration_digest']
+
+
+@pytest.mark.parametrize(
+    ('changed', 'renewed'), [('replay_digest', {'trial'}), ('simulation_digest', {'trial', 'bag'})]
+)
+def test_results_of_other_code_are_not_taken(done, tmp_path, monkeypatch, changed, renewed):
+    _, trials, _ = done
+    run_campaign(trials[:1], tmp_path)
+    files = {
+        'trial': tmp_path / 'trials' / trials[0].name / 'summary.json',
+        'bag': campaign.bag_of(tmp_path, trials[0]) / 'metadata.yaml',
+    }
+    before = {name: path.stat().st_mtime_ns for name, path in files.items()}
+    monkeypatch.setattr(campaign, changed, lambda: 'of other code')
+    run_campaign(trials[:1], tmp_path)
+    assert {name for name, path in files.items() if path.stat().st_mtime_ns != before[name]} == (
+        renewed
+    )
+
+
+def test_a_recording_that_somebody_put_there_is_taken(done, tmp_path, monkeypatch):
+    out, trials, _ = done
+    bag = campaign.bag_of(tmp_path, trials[0])
+    shutil.copytree(campaign.bag_of(out, trials[0]), bag)
+    (bag / campaign.MADE_BY).unlink()
+    monkeypatch.setattr(campaign, '_record', None)  # to record it would fail
+    assert run_campaign(trials[:1], tmp_path)[0].summary is not None
 
 
 def test_two_processes_give_what_one_gives(done, tmp_path):

@@ -4,7 +4,9 @@ Many trials in several processes.
 One failure takes no other along, and an interrupted campaign continues.
 
 OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay
-the same bag OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong
+                          the same bag; made anew when the simulator's code has changed
+OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong; run anew
+                          when configuration, recording, map or the filter's code has changed
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ import shutil
 import traceback
 from typing import Any, TYPE_CHECKING
 
+from continuum_loc.evaluation.replay import one_thread
+from continuum_loc.evaluation.source import replay_digest, simulation_digest
 from continuum_loc.evaluation.study import plain
 from continuum_loc.evaluation.trials import Trial
 
@@ -31,6 +35,7 @@ if TYPE_CHECKING:
 SCHEDULER: ContextVar[str] = ContextVar('scheduler', default='')
 
 CONNECT_LIMIT = 10  # s
+MADE_BY = 'made_by.txt'  # in a recording's folder: the digest of the code that simulated it
 
 Progress = Callable[[Iterator[Any], int, str], Iterator[Any]]
 
@@ -78,12 +83,12 @@ def record_bags(
     trials: Sequence[Trial], out: Path, jobs: int = 1, progress: Progress | None = None
 ) -> dict[str, str]:
     """
-    Simulate the recordings of `trials` that `out` does not hold yet.
+    Simulate the recordings of `trials` that `out` does not hold yet, or holds from other code.
 
     Returns {recording: error} of what failed.
     """
     progress = progress or show_progress
-    bags = {trial.recording: trial for trial in trials if not bag_of(out, trial).is_dir()}
+    bags = {trial.recording: trial for trial in trials if not recorded(bag_of(out, trial))}
     failed = {}
     for done in progress(
         parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), 'simulating'
@@ -102,15 +107,16 @@ def parallel(work: Callable, arguments: list[tuple], jobs: int) -> Iterator[Any]
         yield from _distributed(work, arguments, SCHEDULER.get())
         return
     if jobs == 1:
-        yield from (work(*each) for each in arguments)
+        for each in arguments:
+            with one_thread():
+                result = work(*each)
+            yield result
         return
     import multiprocessing
 
     # Fresh interpreters: forked ones would share the state of numeric libraries' threads.
-    with ProcessPoolExecutor(
-        jobs, multiprocessing.get_context('spawn'), initializer=_one_thread
-    ) as pool:
-        for future in as_completed([pool.submit(work, *each) for each in arguments]):
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn')) as pool:
+        for future in as_completed([pool.submit(_in_worker, work, *each) for each in arguments]):
             yield future.result()
 
 
@@ -132,22 +138,44 @@ def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterat
             f'no Dask scheduler at {address} ({error or type(error).__name__})'
         ) from None
     with client:
-        client.run(_one_thread)
         # The work is seeded, so a cached result would be right; but files are part of it, so
         # nothing is reused.
-        futures = [client.submit(work, *each, pure=False) for each in arguments]
+        futures = [client.submit(_in_worker, work, *each, pure=False) for each in arguments]
         for future in as_distributed(futures):
             yield future.result()
 
 
-def _one_thread() -> None:
-    for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
-        os.environ[name] = '1'
+def _in_worker(work: Callable, *arguments: Any) -> Any:
+    # For good: another thread of this worker must not find the limit lifted.
+    one_thread()
+    return work(*arguments)
 
 
 def bag_of(out: Path, trial: Trial) -> Path:
     """Where the campaign in `out` keeps the bag of a trial."""
     return out / 'bags' / trial.recording
+
+
+def recorded(bag: Path) -> bool:
+    """
+    Whether a recording is there, and from the simulator as it is.
+
+    One that does not say what made it was put there by somebody, who will know.
+    """
+    return bag.is_dir() and made_by(bag) in ('', simulation_digest())
+
+
+def made_by(bag: Path) -> str:
+    """Digest of the code that simulated a recording; empty where it does not say."""
+    mark = bag / MADE_BY
+    return mark.read_text().strip() if mark.is_file() else ''
+
+
+def _remove(bag: Path) -> None:
+    if bag.is_symlink():
+        bag.unlink()
+    elif bag.is_dir():
+        shutil.rmtree(bag)
 
 
 def _record(out: Path, trial: Trial) -> dict[str, str]:
@@ -159,6 +187,8 @@ def _record(out: Path, trial: Trial) -> dict[str, str]:
     try:
         bag.parent.mkdir(parents=True, exist_ok=True)
         write_bag(partial, simulate(trial))
+        (partial / MADE_BY).write_text(simulation_digest() + '\n')
+        _remove(bag)
         partial.rename(bag)  # a bag under its name is a whole one
     except Exception as error:
         shutil.rmtree(partial, ignore_errors=True)
@@ -183,26 +213,25 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
     from continuum_loc.evaluation.trials import (
         configuration,
         make_filter,
-        scene_map,
+        scene_map_file,
         trial_settings,
     )
+    from continuum_loc.mapping.map_files import load_map
     from continuum_loc.robot import load_robot
 
-    estimator = make_filter(
-        load_robot(trial.robot),
-        scene_map(trial.map_scene or trial.scene),
-        settings or trial_settings(trial),
+    settings = settings or trial_settings(trial)
+    map_file = scene_map_file(trial.map_scene or trial.scene)
+    resolved = configuration(trial, estimator=settings)
+    key = configuration_digest(
+        resolved, asdict(trial), replay_digest(), made_by(bag), map_file.name
     )
-    resolved = configuration(trial, estimator=estimator.settings)
-    key = hashlib.sha256(
-        json.dumps([plain(resolved), asdict(trial)], sort_keys=True).encode()
-    ).hexdigest()
     summary_file = folder / 'summary.json'
     if summary_file.is_file():
         summary = json.loads(summary_file.read_text())
         if summary.get('configuration_digest') == key:
             return Outcome(trial, _complete(summary, folder))
     (folder / 'error.txt').unlink(missing_ok=True)
+    estimator = make_filter(load_robot(trial.robot), load_map(map_file), settings)
     result = replay(bag, estimator)
     return Outcome(
         trial,
@@ -215,6 +244,11 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
             extra={'configuration_digest': key},
         ),
     )
+
+
+def configuration_digest(*parts: Any) -> str:
+    """Digest all that decides a result, so that it is taken as it is only while that is so."""
+    return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()
 
 
 def _complete(summary: dict[str, Any], folder: Path) -> dict[str, Any]:

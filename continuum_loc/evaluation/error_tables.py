@@ -89,7 +89,24 @@ def lost_share(outcomes: Sequence[Outcome]) -> float:
 
 
 def trial_rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """One row per trial and ring: the data behind the tables."""
+    """One row per simulated trial and ring: the data behind the tables."""
+    return ring_rows(
+        outcomes,
+        lambda trial: {
+            'map': trial.map_scene or trial.scene,
+            'scene': trial.scene,
+            'trajectory': trial.trajectory,
+            'fidelity': trial.fidelity,
+            'disturbed': trial.disturbed,
+            'seed': trial.seed,
+        },
+    )
+
+
+def ring_rows(
+    outcomes: Sequence[Outcome], about: Callable[[Any], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """One row per trial and ring, begun by what is to be said `about` the trial."""
     keys = [key for key, _ in COLUMNS.values()] + [
         'translation_max_m',
         'nees_per_dof',
@@ -97,20 +114,12 @@ def trial_rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     ]
     rows = []
     for outcome in outcomes:
-        trial = outcome.trial
-        about = {
-            'map': trial.map_scene or trial.scene,
-            'scene': trial.scene,
-            'trajectory': trial.trajectory,
-            'fidelity': trial.fidelity,
-            'disturbed': trial.disturbed,
-            'seed': trial.seed,
-        }
+        said = about(outcome.trial)
         if outcome.summary is None:
-            rows.append({**about, 'ring': '', **dict.fromkeys(keys), 'error': outcome.error})
+            rows.append({**said, 'ring': '', **dict.fromkeys(keys), 'error': outcome.error})
             continue
         rows += [
-            {**about, 'ring': ring, **{key: entry[key] for key in keys}, 'error': ''}
+            {**said, 'ring': ring, **{key: entry[key] for key in keys}, 'error': ''}
             for ring, entry in outcome.summary['rings'].items()
         ]
     return rows

@@ -120,10 +120,20 @@ def _band_traces(
     figure.update_yaxes(
         title_text=name,
         title_font={'size': 11, 'color': colour},
-        rangemode='tozero',
+        range=[0.0, ceiling(values, band)],
         row=row,
         col=1,
     )
+
+
+def ceiling(values: np.ndarray, band: np.ndarray) -> float:
+    """
+    Height of a panel that shows all errors, and their band but for its rare peaks.
+
+    A step without measurements has a band many times the usual one, beside which no error shows.
+    """
+    usual = np.quantile(band[np.isfinite(band)], 0.98) if np.isfinite(band).any() else 0.0
+    return 1.1 * float(max(np.nanmax(values, initial=0.0), usual, 1e-6))
 
 
 def component_figure(found: Errors, epoch: int) -> go.Figure:
@@ -154,6 +164,7 @@ def component_figure(found: Errors, epoch: int) -> go.Figure:
                 scale[component] * array[:, ring, component]
                 for array in (found.pose, 3.0 * found.sigma)
             )
+            band = np.minimum(band, ceiling(np.abs(values), band))
             kept = thin(np.abs(values))
             x = np.concatenate([time[kept], time[kept][::-1]])
             place = {'row': component % 3 + 1, 'col': component // 3 + 1}

@@ -31,6 +31,7 @@ from continuum_loc.measurements import (
 )
 from continuum_loc.robot import RobotDescription
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 SAMPLES = (TofFrame, ImuSample, StrainSample, FieldSample, TrackedPose, EncoderSample, TruthSample)
 CLOUD_PERIOD = NANOSECONDS // 4  # of each sensor, one frame in this time is kept for pictures
@@ -119,7 +120,25 @@ def replay(
 
     It runs in this thread, as fast as it goes.
     """
-    samples = samples_of(source) if isinstance(source, (str, Path)) else source
+    with one_thread():
+        return _replay(
+            samples_of(source) if isinstance(source, (str, Path)) else source, estimator
+        )
+
+
+def one_thread() -> threadpool_limits:
+    """
+    Limit numeric libraries to one thread; as a context manager, until its end.
+
+    On more threads BLAS sums in another order. Left to the machine, to the environment and to
+    what a cluster sets for its workers, the same bag would give another last bit.
+    """
+    import scipy.linalg  # noqa: F401  # brings a BLAS of its own: limited only once loaded
+
+    return threadpool_limits(1)
+
+
+def _replay(samples: Iterable[Measurement | TruthSample], estimator: Filter) -> ReplayResult:
     log = _Log(estimator.robot)
     for sample in samples:
         if isinstance(sample, TruthSample):

@@ -205,18 +205,18 @@ def subtitle(run: Run) -> str:
 def headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Choose the figures that one wants to see first, as (label, value)."""
     cards = [
-        ('translation, mean over rings', _number(summary['translation_mae_m'], 100, ' cm')),
-        ('rotation, mean over rings', _number(summary['rotation_mae_deg'], 1, '°')),
-        ('NEES per degree of freedom', _number(summary['nees_per_dof'])),
-        ('inside the 95 % bound', _number(summary['coverage_95'], 100, ' %', digits=1)),
-        ('real-time factor', _number(summary['real_time_factor'], 1, ' ×', digits=1)),
-        ('step, 99th percentile', _number(summary['step_ms']['p99'], 1, ' ms', digits=1)),
+        ('translation, mean over rings', number(summary['translation_mae_m'], 100, ' cm')),
+        ('rotation, mean over rings', number(summary['rotation_mae_deg'], 1, '°')),
+        ('NEES per degree of freedom', number(summary['nees_per_dof'])),
+        ('inside the 95 % bound', number(summary['coverage_95'], 100, ' %', digits=1)),
+        ('real-time factor', number(summary['real_time_factor'], 1, ' ×', digits=1)),
+        ('step, 99th percentile', number(summary['step_ms']['p99'], 1, ' ms', digits=1)),
     ]
     if 'latency_ms' in summary:
         cards.append(
             (
                 'latency live, 95th percentile',
-                _number(summary['latency_ms']['p95'], 1, ' ms', digits=1),
+                number(summary['latency_ms']['p95'], 1, ' ms', digits=1),
             )
         )
     lost = summary['estimates']['lost']
@@ -232,15 +232,15 @@ def ring_table(summary: Mapping[str, Any]) -> Table:
     """
 
     def row(name: str, entry: Mapping[str, Any], total: bool = False) -> Row:
-        lengths = [_number(entry[f'translation_{key}_m'], 100) for key in ('mae', 'rmse', 'max')]
-        angles = [_number(entry[f'rotation_{key}_deg']) for key in ('mae', 'rmse', 'max')]
+        lengths = [number(entry[f'translation_{key}_m'], 100) for key in ('mae', 'rmse', 'max')]
+        angles = [number(entry[f'rotation_{key}_deg']) for key in ('mae', 'rmse', 'max')]
         return Row(
             [
                 name,
                 *lengths,
                 *angles,
-                _number(entry['nees_per_dof']),
-                _number(entry['coverage_95'], 100, digits=1),
+                number(entry['nees_per_dof']),
+                number(entry['coverage_95'], 100, digits=1),
             ],
             total=total,
         )
@@ -310,10 +310,10 @@ def _worst_group(
                 [
                     f'{(stamp - epoch) / NANOSECONDS:.2f}',
                     found.names[ring],
-                    _number(found.translation_m[index, ring], 100),
-                    _number(band, 100),
-                    _number(found.rotation_deg[index, ring]),
-                    _number(found.nees[index, ring] / DOF),
+                    number(found.translation_m[index, ring], 100),
+                    number(band, 100),
+                    number(found.rotation_deg[index, ring]),
+                    number(found.nees[index, ring] / DOF),
                     status[stamp],
                 ],
                 frame=frame_of.get(stamp),
@@ -354,7 +354,7 @@ def _error_groups(run: Run, found: Errors, epoch: int) -> Iterator[list[Part]]:
     judged = associate(settled(run.result.track), run.result.truth)[0]
     lost = judged.status == 'lost' if judged.status is not None else np.zeros(len(found), bool)
     shade = (
-        'Grey: three standard deviations as the filter states them. '
+        'Grey: three standard deviations as the filter states them, rare peaks cut off. '
         'Yellow: the filter says that it is lost.'
     )
     yield [
@@ -372,7 +372,8 @@ def _error_groups(run: Run, found: Errors, epoch: int) -> Iterator[list[Part]]:
     yield [
         Part(
             'Error by component',
-            "In the ring's own frame, x along the backbone, with plus and minus 3 sigma.",
+            "In the ring's own frame, x along the backbone, with plus and minus 3 sigma, "
+            'rare peaks cut off.',
             figure=chart(figures.component_figure(found, epoch)),
         )
     ]
@@ -385,7 +386,7 @@ def _speed_parts(run: Run) -> Iterator[Part]:
         note = (
             f'{run.summary["data_seconds"]:.1f} s of data in '
             f'{run.result.processing_seconds:.2f} s: '
-            f'real-time factor {_number(factor, digits=1)} on one core.'
+            f'real-time factor {number(factor, digits=1)} on one core.'
         )
         yield Part('Time per step', note, figure=chart(figures.time_histogram(steps, 'step [ms]')))
     latency = 1e3 * run.result.latency_seconds
@@ -406,7 +407,8 @@ def _flat(counts: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, An
             yield where, value
 
 
-def _number(value: float | None, scale: float = 1.0, unit: str = '', digits: int = 2) -> str:
+def number(value: float | None, scale: float = 1.0, unit: str = '', digits: int = 2) -> str:
+    """Write a figure as one reads it; a dash where there is none."""
     if value is None or not np.isfinite(value):
         return '–'
     return f'{scale * value:.{digits}f}{unit}'

@@ -12,7 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from continuum_loc.evaluation.campaign import Outcome
-from continuum_loc.evaluation.report import context_of, Page, Part, render, Row, run_page, Table
+from continuum_loc.evaluation.report import (
+    context_of,
+    number,
+    Page,
+    Part,
+    render,
+    Row,
+    run_page,
+    Table,
+)
 from continuum_loc.evaluation.runs import load_run
 from continuum_loc.evaluation.study import Claim
 
@@ -71,7 +80,8 @@ def with_worst_trial(page: Page, out: Path, ranked: Sequence[Outcome]) -> Page:
         return page
     run = load_run(out / 'trials' / ranked[0].trial.name)
     worst = run_page(run, context_of(run))
-    head = Part(f'The worst trial: {worst.title}', worst.subtitle)
+    judged = ranked[0].summary['translation_mae_m'] is not None
+    head = Part(f'{"The worst trial" if judged else "One trial"}: {worst.title}', worst.subtitle)
     return replace(
         page, groups=[*page.groups, [head], *worst.groups], configuration=worst.configuration
     )
@@ -83,29 +93,25 @@ def claims_part(claims: Sequence[Claim]) -> Part:
         Row(
             [
                 claim.name,
-                f'{claim.value:.4g}',
-                claim.unit,
-                claim.bound,
+                f'{claim.value:.4g} {claim.unit}'.strip().replace(' ', '\u00a0'),
+                claim.bound.replace('<=', '≤').replace('>=', '≥').replace(' ', '\u00a0'),
                 'yes' if claim.holds else 'no',
             ]
         )
         for claim in sorted(claims, key=lambda claim: claim.holds)
     ]
-    return Part(
-        'Claims',
-        table=Table(['claim', 'value', 'unit', 'bound', 'holds'], rows, words=(0, 2, 3, 4)),
-    )
+    return Part('Claims', table=Table(['claim', 'value', 'bound', 'holds'], rows, words=(0, 2, 3)))
 
 
 def worst_part(ranked: Sequence[Outcome]) -> Part:
-    """Show the trials with the greatest mean error, the worst first."""
+    """Show the trials with the greatest mean error, the worst first; without truth, last."""
     rows = [
         Row(
             [
                 one.trial.name,
-                f'{100 * one.summary["translation_mae_m"]:.2f}',
-                f'{100 * one.summary["translation_max_m"]:.2f}',
-                f'{one.summary["rotation_mae_deg"]:.2f}',
+                number(one.summary['translation_mae_m'], 100),
+                number(one.summary['translation_max_m'], 100),
+                number(one.summary['rotation_mae_deg']),
                 f'{one.summary["estimates"]["lost"]} of {one.summary["estimates"]["all"]}',
             ]
         )
@@ -126,12 +132,18 @@ def unbroken(value: Any) -> str:
     return str(value).replace(' ± ', '\u00a0±\u00a0').replace(' - ', '\u00a0-\u00a0')
 
 
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 def as_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Rows of mappings with equal keys as a table of the page."""
     columns = list(rows[0]) if rows else []
-    words = [
-        index for index, name in enumerate(columns) if rows and isinstance(rows[0][name], str)
-    ]
+    words = [index for index, name in enumerate(columns) if rows and not _is_number(rows[0][name])]
     return Table(
         columns,
         [Row([unbroken(row[name]) for name in columns]) for row in rows],

@@ -15,13 +15,18 @@ map; beams that end on it), so that the
 evidence at a place is a share: how many of the beams that could tell disagree with the map. Places
 where most of them do are joined to clusters; the confidence of a cluster is the lower bound of
 that share (Wilson's), which grows with the number of beams and falls with every one that agrees.
+
+Points do not say where between two of them a surface ends. Beams that graze an edge of the map
+therefore disagree with it where nothing has changed, and always at the same places. So a cluster
+counts only where enough of its beams differ from everything that the map shows round their line,
+as far as its spacing goes: what an edge a little elsewhere would explain is no anomaly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import get_args, Literal, NamedTuple
 
 from continuum_loc.mapping.build import DENSITY
 from continuum_loc.mapping.errors import MapError
@@ -35,6 +40,8 @@ import numpy as np
 from pydantic import Field
 
 Kind = Literal['added', 'missing']
+CLEARLY = 0.02  # m: more than a range errs by
+PARALLELS = 6  # lines round a beam along which the map is looked at
 
 
 class AnomalySettings(Settings):
@@ -69,7 +76,15 @@ class AnomalySettings(Settings):
     )
     min_beams: int = Field(10, ge=1, description='disagreeing beams that a cluster needs')
     min_size: float = Field(
-        0.025, ge=0.0, description='extent that a cluster needs [m]: map edges fray by less'
+        0.025,
+        ge=0.0,
+        description='extent that a cluster of few beams needs [m]: map edges fray by less',
+    )
+    many_beams: int = Field(
+        50,
+        ge=1,
+        description='disagreeing beams from which extent does not matter: that of missing things '
+        'is known to the spacing of the map alone',
     )
     disc: float = Field(
         0.6,
@@ -80,8 +95,22 @@ class AnomalySettings(Settings):
     link: float = Field(
         0.03, gt=0.0, description='cells closer than this belong to one cluster [m]'
     )
+    added_width: float = Field(
+        0.5, ge=0.0, description='how far off its line a beam to new things looks, in spacings'
+    )
+    missing_width: float = Field(
+        1.0,
+        ge=0.0,
+        description='the same for missing things: discs overhang the edges of the map by as much',
+    )
+    min_unexplained: float = Field(
+        0.2,
+        ge=0.0,
+        le=1.0,
+        description="share of a cluster's beams that no edge nearby may explain",
+    )
     min_confidence: float = Field(
-        0.6, ge=0.0, le=1.0, description='confidence from which a cluster is worth a look'
+        0.5, ge=0.0, le=1.0, description='confidence from which a cluster is worth a look'
     )
     confidence_z: float = Field(
         1.64, gt=0.0, description="standard deviations of the confidence's lower bound"
@@ -107,6 +136,7 @@ class AnomalyCluster:
     beams: int
     frames: int
     confidence: float
+    witnesses: np.ndarray
 
     @property
     def size(self) -> float:
@@ -118,12 +148,14 @@ class Evidence(NamedTuple):
     """
     What the measurements say of some places, for or against the map.
 
-    Places (N, 3) [m], whether the beam there disagrees with the map (N,), and its stamp (N,) ns.
+    Places (N, 3) [m], whether the beam there disagrees with the map (N,), its stamp (N,) ns, and
+    its row in `Beams` (N,).
     """
 
     places: np.ndarray
     disagrees: np.ndarray
     stamps: np.ndarray
+    rows: np.ndarray
 
 
 class Beams(NamedTuple):
@@ -155,6 +187,16 @@ class Beams(NamedTuple):
         stamps = np.concatenate([r.stamps, np.arange(len(r.open_origins))])
         return cls(origins, directions, length, sigma, stamps)
 
+    def margin(self, prior: PriorMap, settings: AnomalySettings) -> np.ndarray:
+        """(B,) [m] by which a beam's end must be off the map to disagree with it."""
+        return np.maximum(
+            np.sqrt(settings.tau * (self.sigma**2 + prior.sigma**2)), settings.min_distance
+        )
+
+    def of_rows(self, rows: np.ndarray) -> Beams:
+        """Take some of them."""
+        return Beams(*(values[rows] for values in self))
+
 
 def detect_anomalies(
     reconstruction: Reconstruction,
@@ -174,7 +216,57 @@ def detect_anomalies(
     behind = behind_map(beams, prior, index, len(reconstruction.points))
     new = new_evidence(reconstruction, prior, settings, index, behind)
     added = clusters(new, 'added', settings, beams)
-    return sorted(added + missing, key=lambda cluster: -cluster.confidence)
+    found = [
+        cluster
+        for cluster in added + missing
+        if unexplained_share(cluster, beams, prior, settings, index) >= settings.min_unexplained
+    ]
+    return sorted(found, key=lambda cluster: -cluster.confidence)
+
+
+def unexplained_share(
+    cluster: AnomalyCluster,
+    beams: Beams,
+    prior: PriorMap,
+    settings: AnomalySettings,
+    index: VoxelIndex,
+) -> float:
+    """
+    Share of a cluster's witnesses that differ from all that the map shows round their line.
+
+    To new things: they end before the nearest of it. Of missing ones: they end behind the
+    farthest, and there is some all round.
+    """
+    own = beams.of_rows(cluster.witnesses)
+    added, margin = cluster.kind == 'added', own.margin(prior, settings)
+    width = prior.spacing * (settings.added_width if added else settings.missing_width)
+    nearest, farthest = depths_around(prior, index, own, own.lengths + margin, width)
+    differs = own.lengths < nearest - margin if added else own.lengths > farthest + margin
+    return float(np.mean(differs))
+
+
+def depths_around(
+    prior: PriorMap, index: VoxelIndex, beams: Beams, reach: np.ndarray, width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    (B,) nearest and (B,) farthest depth [m] at which the map is crossed on and round each beam.
+
+    Round it: by parallels at `width` [m]. reach: (B,) [m] how far to look; inf where nothing is
+    crossed.
+    """
+    helper = np.eye(3)[np.argmin(np.abs(beams.directions), axis=1)]
+    across = np.cross(beams.directions, helper)
+    across *= width / np.linalg.norm(across, axis=1, keepdims=True)
+    upward = np.cross(beams.directions, across)
+    turns = np.linspace(0.0, 2.0 * np.pi, PARALLELS, endpoint=False)
+    aside = [np.cos(turn) * across + np.sin(turn) * upward for turn in turns]
+    depths = np.stack(
+        [
+            first_crossings(prior, index, beams.origins + offset, beams.directions, reach)[1]
+            for offset in (np.zeros(3), *aside)
+        ]
+    )
+    return depths.min(axis=0), depths.max(axis=0)
 
 
 def new_evidence(
@@ -194,7 +286,9 @@ def new_evidence(
     disagrees = (distance2 > settings.tau) & (offset > settings.min_distance)
     if behind is not None:
         disagrees &= ~behind
-    return Evidence(reconstruction.points, disagrees, reconstruction.stamps)
+    return Evidence(
+        reconstruction.points, disagrees, reconstruction.stamps, np.arange(len(disagrees))
+    )
 
 
 def mahalanobis2(
@@ -229,9 +323,7 @@ def missing_evidence(
     A beam that ends in front of the mapped surface says nothing about it. One without a return
     went its whole length.
     """
-    margin = np.maximum(
-        np.sqrt(settings.tau * (beams.sigma**2 + prior.sigma**2)), settings.min_distance
-    )
+    margin = beams.margin(prior, settings)
     row, depth = first_crossings(
         prior,
         index,
@@ -240,8 +332,8 @@ def missing_evidence(
         beams.lengths + margin,
         radius=settings.disc * prior.spacing,
     )
-    met, through = row >= 0, beams.lengths - depth > margin
-    return Evidence(prior.points[row[met]], through[met], beams.stamps[met])
+    met, through = np.flatnonzero(row >= 0), beams.lengths - depth > margin
+    return Evidence(prior.points[row[met]], through[met], beams.stamps[met], met)
 
 
 def behind_map(beams: Beams, prior: PriorMap, index: VoxelIndex, count: int) -> np.ndarray:
@@ -311,7 +403,8 @@ def _cluster(
     if len(against) < settings.min_beams or frames < settings.min_frames:
         return None
     points = evidence.places[against]
-    if np.ptp(points, axis=0).max() < settings.min_size:
+    small = np.ptp(points, axis=0).max() < settings.min_size
+    if small and len(against) < settings.many_beams:
         return None
     return AnomalyCluster(
         kind,
@@ -321,6 +414,7 @@ def _cluster(
         len(against),
         frames,
         wilson_lower_bound(len(against), len(members), settings.confidence_z),
+        evidence.rows[against],
     )
 
 
@@ -419,27 +513,26 @@ def seen(
 
     Needs a reconstruction from the true poses: it says what could have been detected.
     """
-    return [one for one in truth if _beams_on(one, reconstruction) >= least_beams]
+    return [one for one in truth if beams_on(one, reconstruction) >= least_beams]
 
 
-def _beams_on(truth: Truth, reconstruction: Reconstruction) -> int:
-    if truth.kind == 'added':
-        return int(_near_solid(reconstruction.points, truth, 0.01).sum())
-    if truth.kind != 'missing':
+def beams_on(truth: Truth, reconstruction: Reconstruction) -> int:
+    """
+    Count the beams that met a true anomaly.
+
+    Only those whose line meets its surface: beams that end on the wall close beside a thing do
+    not show it.
+    """
+    if truth.kind not in get_args(Kind):
         raise MapError(f"an anomaly is added or missing, not '{truth.kind}'")
     import open3d
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(np.asarray(truth.vertices, np.float32), np.asarray(truth.faces, np.uint32))
-    rays = np.concatenate(
-        [reconstruction.origins, reconstruction.points - reconstruction.origins], axis=1
-    )
-    depth = scene.cast_rays(rays.astype(np.float32), nthreads=1)[
-        't_hit'
-    ].numpy()  # in units of the beam's length
-    return int(
-        (
-            depth * np.linalg.norm(rays[:, 3:], axis=1)
-            < np.linalg.norm(rays[:, 3:], axis=1) - 0.02
-        ).sum()
-    )
+    along = reconstruction.points - reconstruction.origins
+    length = np.linalg.norm(along, axis=1)
+    rays = np.concatenate([reconstruction.origins, along / length[:, None]], axis=1)
+    depth = scene.cast_rays(rays.astype(np.float32), nthreads=1)['t_hit'].numpy()
+    # What is beyond a range's error: it stopped at something else before, or went on behind.
+    reached = length > depth + (CLEARLY if truth.kind == 'missing' else -CLEARLY)
+    return int(np.count_nonzero(np.isfinite(depth) & reached))

@@ -44,7 +44,9 @@ class FusionSettings(Settings):
     gate: float = Field(
         2.5, gt=0.0, description='standard deviations off the plane at which a cell is left out'
     )
-    min_beams: int = Field(3, ge=1, description='beams that a surfel needs')
+    min_beams: int = Field(
+        10, ge=1, description='beams that a surfel needs: fewer are as often strays as a surface'
+    )
 
 
 @dataclass(frozen=True, eq=False)

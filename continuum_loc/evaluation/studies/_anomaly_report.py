@@ -130,7 +130,13 @@ def scene_figure(result: SceneResult) -> go.Figure:
         figure.add_trace(_outline(truth.vertices, COLOURS[truth.kind]))
     hidden = {'visible': False}
     figure.update_layout(
-        scene={'aspectmode': 'data', 'xaxis': hidden, 'yaxis': hidden, 'zaxis': hidden},
+        scene={
+            'aspectmode': 'data',
+            'xaxis': hidden,
+            'yaxis': hidden,
+            'zaxis': hidden,
+            'camera': {'eye': {'x': -0.75, 'y': -0.75, 'z': 0.4}},
+        },
         margin={'l': 0, 'r': 0, 't': 0, 'b': 0},
         height=520,
         legend={'orientation': 'h', 'y': 0, 'x': 0, 'itemsizing': 'constant'},

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-import hashlib
 import json
 from pathlib import Path
 import re
@@ -17,14 +16,23 @@ from typing import Any
 
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
-from continuum_loc.evaluation.campaign import bag_of, parallel, record_bags, show_progress
+from continuum_loc.evaluation.campaign import (
+    bag_of,
+    configuration_digest,
+    made_by,
+    parallel,
+    record_bags,
+    show_progress,
+)
 from continuum_loc.evaluation.metrics import Errors, errors
 from continuum_loc.evaluation.replay import Filter, replay, samples_of
 from continuum_loc.evaluation.runs import load_run, Run, save_run
-from continuum_loc.evaluation.study import Claim, plain, write_json
+from continuum_loc.evaluation.source import replay_digest
+from continuum_loc.evaluation.study import Claim, write_json
 from continuum_loc.evaluation.tables import markdown
 from continuum_loc.evaluation.tracks import associate
-from continuum_loc.evaluation.trials import configuration, make_filter, scene_map, Trial
+from continuum_loc.evaluation.trials import configuration, make_filter, scene_map_file, Trial
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import Measurement, NANOSECONDS, nanoseconds, TruthSample
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
@@ -156,13 +164,12 @@ def replay_case(out: Path, case: Case) -> tuple[str, str]:
 def _replay(out: Path, case: Case, folder: Path) -> None:
     trial, settings = case.trial, case_settings(case)
     resolved = configuration(trial, estimator=settings, case=case, faults=repr(case.faults))
-    key = hashlib.sha256(json.dumps(plain(resolved), sort_keys=True).encode()).hexdigest()
+    bag, map_file = bag_of(out, trial), scene_map_file(trial.map_scene or trial.scene)
+    key = configuration_digest(resolved, replay_digest(), made_by(bag), map_file.name)
     if _digest(folder) == key:
         return
-    witness = Witness(
-        make_filter(load_robot(trial.robot), scene_map(trial.map_scene or trial.scene), settings)
-    )
-    result = replay(case_samples(samples_of(bag_of(out, trial)), case), witness)
+    witness = Witness(make_filter(load_robot(trial.robot), load_map(map_file), settings))
+    result = replay(case_samples(samples_of(bag), case), witness)
     (folder / 'error.txt').unlink(missing_ok=True)
     save_run(
         folder,
