@@ -504,9 +504,12 @@ def _motion_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
 
 
 def _pieces_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
-    own, cut = rows
+    own, _, cut = rows
     yield at_most(
-        "S0's own contact pieces stand out of its surface by", own[_GREATEST], 'mm', SURFACE
+        "S0's own contact pieces, short of the casing, stand out of its surface by",
+        own[_GREATEST],
+        'mm',
+        SURFACE,
     )
     yield at_most(
         f'{cut["pieces"]} pieces cut from S0 as one mesh stand out of its surface by',
