@@ -117,7 +117,15 @@ def simulate(
     bag: Annotated[Path, typer.Argument(help='new bag folder to write')],
     robot: Robot = 'engine',
     scene: Scene = 'S0',
-    trajectory: Annotated[str, typer.Option(help='named motion of the robot')] = 't1',
+    trajectory: Annotated[
+        str, typer.Option(help='named motion of the robot, or your own (YAML)')
+    ] = 't1',
+    plant: Annotated[
+        str | None,
+        typer.Option(
+            help="stiffness, mass, tendons: bundled name or your own (YAML); default: the robot's"
+        ),
+    ] = None,
     profile: Annotated[
         str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")
     ] = 'full',
@@ -125,7 +133,7 @@ def simulate(
     duration: Annotated[
         float | None, typer.Option(help='seconds; default: the whole trajectory')
     ] = None,
-    seed: Seed = 0,
+    seed: Annotated[int, typer.Option(help='seed of everything random', min=0)] = 0,
 ) -> None:
     """
     Record a simulated trial, sensors and truth, into a bag (rosbag2, MCAP) as fast as it goes.
@@ -135,7 +143,14 @@ def simulate(
     from continuum_loc.evaluation.trials import Trial, world, write_bag
 
     trial = Trial(
-        robot, scene, trajectory, profile=profile, fidelity=fidelity, seed=seed, duration=duration
+        robot,
+        scene,
+        trajectory,
+        plant=plant,
+        profile=profile,
+        fidelity=fidelity,
+        seed=seed,
+        duration=duration,
     )
     with _busy() as status:
         status.update('building the scene and letting the robot come to rest')

@@ -96,6 +96,18 @@ class Insertion(Settings):
     )
     sigma: float = Field(0.0005, gt=0.0, description='standard deviation of the encoder [m]')
 
+    @model_validator(mode='after')
+    def _consistent(self) -> Insertion:
+        least, most = self.range
+        if least > most:
+            raise ValueError(f'range: the least travel comes first, got [{least}, {most}]')
+        if self.mode == 'fixed' and least != most:
+            raise ValueError(
+                f'range [{least}, {most}] with mode fixed: a base that travels is '
+                'measured or unknown; leave the range out for one that does not'
+            )
+        return self
+
 
 class Base(Settings):
     """Pose of the base in `map` at zero insertion, and how well it is known."""
@@ -167,6 +179,24 @@ class TofModel(Settings):
     # Table I of the paper: sigma = coefficient(d) * d, the coefficient interpolated linearly.
     noise_distance: tuple[float, ...] = (0.025, 0.6, 1.2)
     noise_coefficient: tuple[float, ...] = (0.014, 0.012, 0.006)
+
+    @model_validator(mode='after')
+    def _consistent(self) -> TofModel:
+        if self.min_range >= self.max_range:
+            raise ValueError(
+                f'min_range {self.min_range} m must be below max_range {self.max_range} m'
+            )
+        distance, coefficient = self.noise_distance, self.noise_coefficient
+        if not distance or len(distance) != len(coefficient):
+            raise ValueError(
+                'noise_distance and noise_coefficient must have one value each per row of the '
+                f'table, got {len(distance)} and {len(coefficient)}'
+            )
+        if list(distance) != sorted(set(distance)):
+            raise ValueError(f'noise_distance must increase, got {list(distance)}')
+        if min(coefficient) <= 0.0:
+            raise ValueError(f'noise_coefficient must be greater than 0, got {list(coefficient)}')
+        return self
 
     @cached_property
     def directions(self) -> np.ndarray:
@@ -279,14 +309,22 @@ class RobotDescription(Settings):
                     f'rings: {", ".join(self.ring_names)}'
                 )
         for sensor in self.tof:
-            if np.linalg.norm(sensor.mount.T_ring_sensor[1:3, 3]) < self.radius - 1e-9 and (
-                sensor.mount.T_ring_sensor[0, 0] < 0.5
-            ):
-                raise ValueError(
-                    f"ToF sensor '{sensor.name}' sits inside the body (radius {self.radius} m) "
-                    'and looks sideways: move it to the surface or beyond'
-                )
+            self._check_outside(sensor)
         return self
+
+    def _check_outside(self, sensor: Sensor) -> None:
+        """Refuse a ToF sensor that looks at its own body from within, but for one at an end."""
+        T = sensor.mount.T_ring_sensor
+        if np.linalg.norm(T[1:3, 3]) >= self.radius - 1e-9:
+            return
+        s = self.ring_arclengths[self.ring_names.index(sensor.ring)] + T[0, 3]
+        if s >= self.length - self.radius and T[0, 0] >= 0.5:
+            return
+        raise ValueError(
+            f"ToF sensor '{sensor.name}' sits inside the body (radius {self.radius} m) at "
+            f's = {s:g} m: move it to the surface or beyond; only at the tip may one look forward '
+            'from within'
+        )
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:

@@ -25,9 +25,11 @@ class SettingsError(ValueError):
 
 
 class Settings(BaseModel):
-    """Base of all typed settings: immutable, and unknown keys are errors."""
+    """Base of all typed settings: immutable; unknown keys and what is not finite are errors."""
 
-    model_config = ConfigDict(extra='forbid', frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        extra='forbid', frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False
+    )
 
 
 S = TypeVar('S', bound=Settings)
@@ -44,6 +46,8 @@ def load_settings(model: type[S], path: str | Path) -> S:
         data = yaml.safe_load(path.read_text())
     except OSError as error:
         raise SettingsError(f'{path}: cannot be read ({error.strerror})') from None
+    except UnicodeDecodeError:
+        raise SettingsError(f'{path}: not a text file; write YAML in UTF-8') from None
     except yaml.YAMLError as error:
         raise SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     return parse_settings(model, data if data is not None else {}, where=str(path))
@@ -83,8 +87,14 @@ def dump_settings(settings: Settings, path: str | Path) -> None:
 
 def _explain(model: type[Settings], item: dict) -> str:
     place = '.'.join(str(part) for part in item['loc']) or '(top level)'
+    if item['type'] == 'value_error':  # our own validators, which say themselves what they got
+        message = str(item['ctx']['error'])
+        return f'{place}: {message}' if item['loc'] else message
     if item['type'] != 'extra_forbidden':
-        return f'{place}: {item["msg"]} (got {item.get("input")!r})'
+        got = item.get('input')
+        # Of a whole mapping or list, the place says more than its content.
+        said = '' if isinstance(got, (dict, list)) and len(got) > 3 else f' (got {got!r})'
+        return f'{place}: {item["msg"]}{said}'
     valid = _fields_at(model, item['loc'][:-1])
     close = difflib.get_close_matches(str(item['loc'][-1]), valid, n=1, cutoff=0.0)
     hint = f"; did you mean '{close[0]}'?" if close else ''

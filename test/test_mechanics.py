@@ -1,6 +1,7 @@
 """The simulated rod obeys mechanics: statics, stretch, frequency, dissipation, tendons."""
 
 from continuum_loc.evaluation.studies.simulator import first_mode
+from continuum_loc.lie import rotation_error_deg
 from continuum_loc.robot import Ring, RobotDescription
 from continuum_loc.settings import parse_settings, SettingsError
 from continuum_loc.simulator import model as rod_model
@@ -281,7 +282,12 @@ def test_the_full_engine_profile_is_the_papers():
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'GJ': 4.0}, 'GJ = 4.0 must equal EI'),
+        ({'GJ': 0.4}, 'GJ = 0.4 must lie between 0.1 and 1.8 times EI = 5.0'),
+        ({'GJ': 9.1}, 'GJ = 9.1 must lie between'),
+        (
+            {'tendons': load_plant('engine').model_dump()['tendons'][::-1]},
+            r'from base to tip.* ends \[1.5, 1.0, 0.5\]',
+        ),
         ({'EI': -1.0}, 'EI'),
         ({'stifness': 1.0}, "unknown key 'stifness'"),
         ({'profiles': {'live': {'link_length': 0.03, 'time_step': 0.5}}}, 'time_step'),
@@ -299,3 +305,46 @@ def test_unknown_plants_and_profiles_name_the_valid_ones():
         load_plant('enginee')
     with pytest.raises(SettingsError, match='full, live'):
         load_plant('engine').profile('fast')
+
+
+# Torsion of its own, beside the ball joints' one stiffness.
+
+
+@pytest.mark.parametrize('ratio', [0.3, 1.0 / 1.3, 1.7])
+def test_an_end_torque_twists_a_straight_rod_by_TL_over_GJ(ratio):
+    torque = 0.02
+    _, R = settled_tip(24, moment=(torque, 0, 0), GJ=ratio * EI)
+    turn = np.zeros(3)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, R.ravel())
+    mujoco.mju_quat2Vel(turn, quat, 1.0)
+    np.testing.assert_allclose(
+        turn, [torque * LENGTH / (ratio * EI), 0.0, 0.0], rtol=1e-3, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize('ratio', [0.3, 1.0 / 1.3, 1.7])
+def test_a_bent_and_twisted_rod_is_the_cosserat_rod_of_its_own_torsion(ratio):
+    """The error falls with the square of the link length, as without torsion."""
+    force, moment = (0.0, 0.05, -0.05), (0.03, 0.0, 0.02)
+    T = cosserat_shape([LENGTH], LENGTH, EI, ratio * EI, tip_force=force, tip_moment=moment)[0]
+
+    def turned(links, GJ):  # torsion turns the tip, and does not move it
+        R = settled_tip(links, force, moment, GJ=GJ)[1]
+        return rotation_error_deg(R, T[:3, :3])
+
+    coarse, fine = (turned(links, ratio * EI) for links in (12, 24))
+    assert fine < 0.2
+    assert 1.8 < np.log2(coarse / fine) < 2.2
+    assert turned(24, EI) > 20.0 * fine
+
+
+def test_a_plant_without_torsion_of_its_own_gets_no_torque():
+    assert uniform_rod(4, LENGTH, EI, MASS).nuser_jnt == 0
+    assert build_model_of('engine').nuser_jnt == 0
+
+
+def build_model_of(name):
+    from continuum_loc.robot import load_robot
+
+    return build_model(load_robot(name), load_plant(name))

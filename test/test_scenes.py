@@ -4,6 +4,7 @@ Scenes: closed, of the stated size, with free way for the robot.
 And with exact truth of their anomalies.
 """
 
+from continuum_loc.evaluation.studies._pieces import standing_out
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator import convex, cutting, mesh_import, scene_cache
 from continuum_loc.simulator.mesh_import import check_mesh
@@ -12,6 +13,7 @@ from continuum_loc.simulator.scene import Anomaly, Scene, SceneError
 from continuum_loc.simulator.scenes import load_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 import trimesh
@@ -335,7 +337,7 @@ def test_plane_cuts_leave_bores_windows_and_cavities_open(make):
     caster = RayCaster(scene_of_mesh(solid.vertices, solid.faces))
     rng = np.random.default_rng(0)
     outline = np.concatenate([hull.sample(500, seed=int(rng.integers(1e6))) for hull in hulls])
-    assert caster.clearance(outline).max() < 1.2 * 0.003  # gaps are measured at face centres
+    assert caster.clearance(outline).max() < 0.003 + 1e-5
     points = rng.uniform(*solid.bounds, (20_000, 3))
     matter = points[caster.clearance(points) < -1e-4]
     inside = np.any([inside_hull(hull, matter) for hull in hulls], axis=0)
@@ -364,8 +366,44 @@ def test_plane_cuts_of_any_heap_of_boxes_are_its_matter(seed):
     caster = RayCaster(scene_of_mesh(heap.vertices, heap.faces))
     assert caster.clearance(np.concatenate(pieces)).max() < 1e-4
     outline = np.concatenate([hull.sample(300, seed=1) for hull in hulls])
-    assert caster.clearance(outline).max() < 0.006
+    assert caster.clearance(outline).max() < 0.004 + 1e-5
     assert sum(hull.volume for hull in hulls) > 0.999 * heap.volume
+
+
+def shell(thickness=0.004):
+    """Make a quarter of a bent plate, as thin as the tolerance: slices of it look flat."""
+    outer, inner = (trimesh.creation.cylinder(r, 0.3, sections=96) for r in (0.4, 0.4 - thickness))
+    inner.apply_scale((1.0, 1.0, 1.5))
+    quarter = trimesh.creation.box((0.4, 0.4, 0.3)).apply_translation((0.2, 0.2, 0.0))
+    plate = trimesh.boolean.difference([outer, inner], engine='manifold')
+    return trimesh.boolean.intersection([plate, quarter], engine='manifold')
+
+
+def disc_with_a_stub():
+    """Make a thin disc, and a small stub on it that its hull has to reach."""
+    disc = trimesh.creation.cylinder(0.4, 0.02, sections=96)
+    stub = trimesh.creation.cylinder(0.002, 0.05, sections=8).apply_translation((0.3, 0.0, 0.02))
+    return trimesh.boolean.union([disc, stub], engine='manifold')
+
+
+@pytest.mark.parametrize(('make', 'most'), [(shell, 20), (disc_with_a_stub, 6)])
+def test_thin_pieces_keep_the_tolerance_and_are_no_pile_of_slices(make, most):
+    solid = make()
+    pieces = list(cutting.pieces(solid.vertices, solid.faces, 0.004))
+    assert len(pieces) <= most
+    scene = scene_of_mesh(solid.vertices, solid.faces)
+    assert standing_out(scene, pieces).max() < 0.004 + 1e-5
+    assert min(np.ptp(piece, axis=0).max() for piece in pieces) > 0.004
+
+
+@given(arrays(float, (4, 3), elements=st.floats(-1.0, 1.0)))
+@settings(max_examples=200, deadline=None)
+def test_distance_to_a_triangle_is_trimeshs(points):
+    point, *corners = points
+    nearest = trimesh.triangles.closest_point(np.array([corners]), point[None])[0]
+    if np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) > 1e-4:
+        found = cutting._to_triangle(point, np.array(corners))
+        assert np.sqrt(found) == pytest.approx(np.linalg.norm(nearest - point), abs=1e-6)
 
 
 def test_large_meshes_are_cut_in_tiles_and_the_cost_is_said_first(caplog):

@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -729,3 +730,21 @@ def test_world_applies_its_faults_in_order(scene):
 def test_a_fault_that_ends_before_it_starts_is_refused():
     with pytest.raises(ValueError, match='must come before'):
         faults.Dropout(start=2.0, end=1.0)
+
+
+def test_the_robot_of_the_documentation_is_simulated(tmp_path):
+    """A newcomer's first files are those of docs/simulator.md."""
+    text = (Path(__file__).parents[1] / 'docs' / 'simulator.md').read_text()
+    files = dict(re.findall(r'`(my_\w+\.yaml)`[^`]*```yaml\n(.*?)```', text, re.DOTALL))
+    assert set(files) == {'my_robot.yaml', 'my_plant.yaml', 'my_path.yaml'}
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    world = World(
+        load_robot(tmp_path / 'my_robot.yaml'),
+        None,
+        str(tmp_path / 'my_path.yaml'),
+        plant=tmp_path / 'my_plant.yaml',
+        profile='full',
+    )
+    truth = [s.T_map_ring for s in world.run(4.0) if type(s) is TruthSample]
+    assert np.linalg.norm(truth[-1][-1, :3, 3] - truth[0][-1, :3, 3]) > 0.1

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import hashlib
 import os
 from pathlib import Path
+import shutil
 from typing import Any, TYPE_CHECKING
 
 from continuum_loc import lie
@@ -40,7 +41,7 @@ class Trial:
 
     robot: a bundled name or a YAML file. scene, map_scene: scene names or mesh files; the prior
     map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
-    `paper` or `vl53l5cx`.
+    `paper` or `vl53l5cx`. plant: a bundled name or a YAML file; None for the robot's own.
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
     drawn_base: the base sits where a draw from the description's own spread puts it, not where
     the description says: what a covariance that counts with this spread has to be judged by.
@@ -57,6 +58,7 @@ class Trial:
     drawn_base: bool = False
     seed: int = 0
     duration: float | None = None
+    plant: str | None = None
 
     @property
     def recording(self) -> str:
@@ -73,6 +75,7 @@ class Trial:
                 ]
                 + ['disturbed'] * self.disturbed
                 + ['drawn'] * self.drawn_base
+                + [Path(self.plant or '').stem] * bool(self.plant)
             )
             + f'-{self.seed}{length}'
         )
@@ -97,6 +100,7 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         robot,
         load_scene(trial.scene) if robot.tof else None,
         trial.trajectory,
+        plant=trial.plant,
         profile=trial.profile,
         tof_fidelity=trial.fidelity,
         seed=trial.seed,
@@ -200,16 +204,25 @@ def map_cache() -> Path:
 
 
 def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[str, int]:
-    """Record samples into a new bag folder; how many of each topic."""
+    """
+    Record samples into a new bag folder; how many of each topic.
+
+    Where the samples end in an error, no bag is left: half of one would pass for the whole.
+    """
     from msg_tools.bag import BagWriter
     from msg_tools.topics import topic_of
 
     counts: dict[str, int] = {}
-    with BagWriter(path) as bag:
-        for sample in samples:
-            topic = topic_of(sample)
-            bag.write(topic, sample)
-            counts[topic] = counts.get(topic, 0) + 1
+    bag = BagWriter(path)
+    try:
+        with bag:
+            for sample in samples:
+                topic = topic_of(sample)
+                bag.write(topic, sample)
+                counts[topic] = counts.get(topic, 0) + 1
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
     return counts
 
 

@@ -22,7 +22,7 @@ import numpy as np
 SMALL = 2000  # faces that CoACD gets done within tens of seconds
 _THRESHOLD = 0.02  # CoACD's concavity, as a share of the mesh's size
 _FINEST, _FINENESS = 1e-3, 500.0  # tolerance of plane cuts: 1 mm, or a 500th of the longest edge
-_SECONDS_PER_FACE = 3e-4  # of plane cuts, on a core of its own
+_SECONDS_PER_FACE = 4e-4  # of plane cuts, on a core of its own
 _MODULE = 'continuum_loc.simulator.convex'
 
 _log = logging.getLogger(__name__)

@@ -41,7 +41,10 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     It needs a credible size, no degenerate faces and no holes, and an orientation.
     """
     if len(faces) == 0:
-        raise SceneError(f'{where}: no faces; export a triangle mesh, not points or curves')
+        raise SceneError(
+            f'{where}: no faces; export a triangle mesh, not points or curves, and name the file '
+            'by what it is (.stl, .obj, .ply)'
+        )
     if not np.all(np.isfinite(vertices)):
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise SceneError(
@@ -56,7 +59,11 @@ def _load(path: Path):
     import trimesh
 
     if not path.is_file():
-        raise SceneError(f'{path}: no such file')
+        raise SceneError(
+            f'{path}: {"a folder, not a mesh file" * path.is_dir() or "no such file"}'
+        )
+    if path.stat().st_size == 0:
+        raise SceneError(f'{path}: the file is empty; export the mesh again')
     try:
         mesh = trimesh.load(path, force='mesh', process=False)
     except Exception as error:  # the parsers raise whatever they stumble on

@@ -39,6 +39,7 @@ STICTION = (
     0.5,
     2.0,
 )
+LEAST_INERTIA = 1e-15  # kg and kg m^2: MuJoCo's least
 DIVERGED_SPEED = 1e3  # rad/s or m/s
 GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
 
@@ -72,8 +73,11 @@ def build_spec(
     # Divergence is ours to report.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.compiler.autolimits = True
+    if plant.GJ != plant.EI:
+        spec.nuser_jnt = 1
     nodes = node_arclengths(robot, plant, chosen.link_length)
-    _check_step(plant, nodes, chosen.time_step)
+    if robot.base.insertion.mode != 'fixed':
+        _check_step(plant, chosen.time_step)
     _add_rod(spec, robot, plant, nodes)
     _add_tendons(spec, plant, nodes)
     if scene is not None:
@@ -88,14 +92,27 @@ def build_model(
     profile: str = 'live',
     supported: bool = False,
 ) -> mujoco.MjModel:
-    """Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip."""
-    return build_spec(robot, plant, scene, profile, supported).compile()
+    """
+    Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip.
+
+    Raises SettingsError.
+    """
+    spec = build_spec(robot, plant, scene, profile, supported)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise SettingsError(
+            f"no model can be made of robot '{robot.name}' with this plant and scene: "
+            f'{" ".join(str(error).split())}'
+        ) from None
 
 
 def advance(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """One step. Raises SimulationDiverged, with the joint and what to change."""
     import mujoco
 
+    if model.nuser_jnt:
+        _add_twist_torque(model, data)
     mujoco.mj_step(model, data)
     speed = np.abs(data.qvel)
     if np.isfinite(data.qacc).all() and speed.max(initial=0.0) < DIVERGED_SPEED:
@@ -107,6 +124,22 @@ def advance(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         f'({speed[worst]:.3g} rad/s or m/s): shorten `time_step` (now {model.opt.timestep} s) '
         'or raise `relaxation` in the plant, or lower the forces there'
     )
+
+
+def _add_twist_torque(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """
+    Make up for what a ball joint's spring, with one stiffness for all axes, has too much of twist.
+
+    With w the joint's rotation vector and c = (EI - GJ) / h, the energy -c w_x^2 / 2 to be added
+    gives the torque c w_x (1, -w_z / 2, w_y / 2) in the link's frame, to second order in w.
+    """
+    excess = model.jnt_user[:, 0]
+    joints = np.flatnonzero(excess)
+    quat = data.qpos[model.jnt_qposadr[joints, None] + np.arange(4)]
+    w = Rotation.from_quat(quat, scalar_first=True).as_rotvec()
+    lever = np.stack([np.ones(len(joints)), -w[:, 2] / 2.0, w[:, 1] / 2.0], axis=1)
+    torque = (excess[joints] * w[:, 0])[:, None] * lever
+    data.qfrc_applied[model.jnt_dofadr[joints, None] + np.arange(3)] = torque
 
 
 def settle(model: mujoco.MjModel, data: mujoco.MjData, rest_speed: float = REST_SPEED) -> None:
@@ -140,12 +173,15 @@ def uniform_rod(
     mass_per_metre: float,
     *,
     EA: float | None = None,
+    GJ: float | None = None,
     supported: bool = False,
     relaxation: float = 0.05,
     time_step: float = 0.005,
 ) -> mujoco.MjModel:
     """
     Make a plain rod along x, clamped at the origin, for comparison with mechanics.
+
+    GJ: None is that of the ball joints alone, EI.
 
     Its last body, `tip`, has no mass and lies at the rod's end: loads go there.
     """
@@ -155,7 +191,7 @@ def uniform_rod(
     profile = Profile(link_length=length / links, time_step=time_step)
     plant = PlantSettings(
         EI=EI,
-        GJ=EI,
+        GJ=EI if GJ is None else GJ,
         EA=EA,
         mass_per_metre=mass_per_metre,
         relaxation=relaxation,
@@ -167,7 +203,7 @@ def uniform_rod(
     return spec.compile()
 
 
-def _check_step(plant: PlantSettings, nodes: np.ndarray, time_step: float) -> None:
+def _check_step(plant: PlantSettings, time_step: float) -> None:
     """
     Check that the time step is stable: omega * step < 2 of the insertion drive.
 
@@ -243,13 +279,15 @@ def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
             stiffness=[plant.EA / segment, 0, 0],
             damping=[plant.relaxation * plant.EA / segment, 0, 0],
         )
-    body.add_joint(
+    bend = body.add_joint(
         name=f'bend{i}',
         type=mujoco.mjtJoint.mjJNT_BALL,
         pos=pos,
         stiffness=[plant.EI / segment, 0, 0],
         damping=[plant.relaxation * plant.EI / segment, 0, 0],
     )
+    if plant.GJ != plant.EI:
+        bend.userdata = [(plant.EI - plant.GJ) / segment]
 
 
 def _add_link(
@@ -266,6 +304,12 @@ def _add_link(
     mass = plant.mass_per_metre * length
     axial = mass * robot.radius**2 / 2.0
     across = mass * (robot.radius**2 / 4.0 + length**2 / 12.0)
+    if min(mass, axial, across) < LEAST_INERTIA:
+        raise SettingsError(
+            f'plant: mass_per_metre = {plant.mass_per_metre} kg/m makes links of {mass:.3g} kg '
+            f'and {min(axial, across):.3g} kg m^2; both must be above {LEAST_INERTIA}: give the '
+            'true mass, or longer links'
+        )
     body.mass, body.ipos, body.inertia = mass, (centre, 0.0, 0.0), (axial, across, across)
     body.explicitinertial = True
     body.add_geom(

@@ -16,6 +16,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 PLANTS_FOLDER = Path(__file__).parent / 'plants'
+# Of GJ / EI. The torque that makes the difference is explicit in time: against the implicit spring
+# it is stable below 2, with a margin here.
+_LEAST_TWIST, _MOST_TWIST = 0.1, 1.8
+MOST_LINKS = 1000  # the cost of a step grows with the cube: 150 links are already slow
 
 
 class TendonSet(Settings):
@@ -45,8 +49,8 @@ class PlantSettings(Settings):
     """
     A uniform rod with tendons. Moments are linear in strain: bending EI, twist GJ, stretch EA.
 
-    EA `null` is an inextensible rod; the joint of two links is a ball joint, which has one
-    stiffness for all its axes, so GJ must equal EI.
+    EA `null` is an inextensible rod. The bundled plants have GJ = EI, the one stiffness of a ball
+    joint; another GJ is brought about by a torque beside the joint's spring (`model.advance`).
     """
 
     EI: float = Field(gt=0.0, description='bending stiffness [N m^2]')
@@ -70,11 +74,16 @@ class PlantSettings(Settings):
     profiles: dict[str, Profile] = Field(min_length=1)
 
     @model_validator(mode='after')
-    def _isotropic(self) -> PlantSettings:
-        if not np.isclose(self.EI, self.GJ, rtol=1e-9):
+    def _consistent(self) -> PlantSettings:
+        if not _LEAST_TWIST * self.EI <= self.GJ <= _MOST_TWIST * self.EI:
             raise ValueError(
-                f'GJ = {self.GJ} must equal EI = {self.EI}: '
-                'a ball joint has one stiffness for all axes'
+                f'GJ = {self.GJ} must lie between {_LEAST_TWIST} and {_MOST_TWIST} times EI = '
+                f'{self.EI}; a round solid rod has GJ = EI / (1 + nu), about 0.75 EI'
+            )
+        ends = [group.end for group in self.tendons]
+        if ends != sorted(set(ends)):
+            raise ValueError(
+                f'tendons: sets must be listed from base to tip, one per end, got ends {ends}'
             )
         return self
 
@@ -110,9 +119,14 @@ class PlantSettings(Settings):
 
         moments: (..., G, 2) total moment about body y and z [N m] inside each tendon set's own
         stretch, base to tip. A set also bends every stretch before its own, so it supplies the
-        difference to the next one. Raises ValueError where a tendon would have to pull harder than
-        it may.
+        difference to the next one. Raises SettingsError where a tendon would have to pull harder
+        than it may, or where the plant has other sets than moments are given for.
         """
+        if not self.tendons or moments.shape[-2] != len(self.tendons):
+            raise SettingsError(
+                f'this trajectory bends {moments.shape[-2]} modules, the plant has '
+                f'{len(self.tendons)} sets of tendons: give a trajectory (.yaml) for this plant'
+            )
         wanted = moments - np.concatenate(
             [moments[..., 1:, :], np.zeros_like(moments[..., :1, :])], axis=-2
         )
@@ -127,9 +141,10 @@ class PlantSettings(Settings):
         if excess.max() > 1.0:
             worst = int(np.argmax(excess))
             limit = self.max_forces[worst]
-            raise ValueError(
+            raise SettingsError(
                 f'{self.tendon_names[worst]} would have to pull {excess[worst] * limit:.0f} N, '
-                f'its limit is {limit:.0f} N: ask for less bending'
+                f'its limit is {limit:.0f} N: ask for less bending, or raise max_force in the '
+                'plant'
             )
         return tensions
 
@@ -156,6 +171,11 @@ def load_plant(name_or_path: str | Path) -> PlantSettings:
     return load_bundled(PlantSettings, PLANTS_FOLDER, name_or_path, 'plant')
 
 
+def bundled_plants() -> tuple[str, ...]:
+    """Names of the plants that come with the package."""
+    return tuple(sorted(file.stem for file in PLANTS_FOLDER.glob('*.yaml')))
+
+
 def node_arclengths(
     robot: RobotDescription, plant: PlantSettings, link_length: float
 ) -> np.ndarray:
@@ -167,15 +187,34 @@ def node_arclengths(
     A node at every ring makes the ring's pose a body's pose, with no interpolation between the
     two.
     """
+    _check_fit(robot, plant, link_length)
     cuts = np.unique(
         np.round([0.0, robot.length, *robot.ring_arclengths, *(g.end for g in plant.tendons)], 9)
     )
-    if cuts[-1] > robot.length + 1e-9:
-        raise SettingsError(
-            f"a tendon set ends at s = {cuts[-1]} m, beyond the robot's length {robot.length} m"
-        )
     pieces = [
         np.linspace(a, b, max(1, round((b - a) / link_length)), endpoint=False)
         for a, b in zip(cuts, cuts[1:], strict=False)
     ]
     return np.append(np.concatenate(pieces), cuts[-1])
+
+
+def _check_fit(robot: RobotDescription, plant: PlantSettings, link_length: float) -> None:
+    """Refuse a plant that cannot be this robot's."""
+    for i, group in enumerate(plant.tendons):
+        if group.end > robot.length + 1e-9:
+            raise SettingsError(
+                f'plant: tendons.{i}.end = {group.end} m lies beyond the length '
+                f"{robot.length} m of robot '{robot.name}'"
+            )
+        if group.radius > robot.radius:
+            raise SettingsError(
+                f'plant: tendons.{i}.radius = {group.radius} m lies outside the body of robot '
+                f"'{robot.name}', whose radius is {robot.radius} m"
+            )
+    links = robot.length / link_length
+    if links > MOST_LINKS:
+        raise SettingsError(
+            f"plant: link_length {link_length} m cuts robot '{robot.name}' into {links:.0f} "
+            f'links; at most {MOST_LINKS} are possible: use at least '
+            f'{robot.length / MOST_LINKS:g} m'
+        )

@@ -223,7 +223,7 @@ def _box(T_map_box: np.ndarray, half: float, colour: tuple[float, float, float])
 
 # What to draw: robot, trajectory, moment [s], scene (None: the robot alone), camera.
 _ENGINE = Camera((-0.3, -1.9, 1.35), (0.85, 0.0, 0.95), fov_deg=60.0, section=-0.12)
-_BOX = Camera((0.38, -1.40, 0.80), (0.03, 0.0, 0.26), fov_deg=41.0, section=-0.345)
+_BOX = Camera((0.38, -1.40, 0.80), (0.03, 0.0, 0.22), fov_deg=49.0, section=-0.345)
 PICTURES = {
     'robot_engine': (
         'engine',

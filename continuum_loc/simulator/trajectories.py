@@ -52,7 +52,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         values = np.column_stack([self.tensions, self.insertion])
-        if self.tensions.min() < 0.0:
+        if self.tensions.min(initial=0.0) < 0.0:
             raise ValueError(
                 f"trajectory '{self.name}': tendons only pull, got {self.tensions.min()} N"
             )
@@ -189,6 +189,7 @@ def _from_file(path: str, plant: PlantSettings) -> Trajectory:
                 f"{path}: keyframes.{k}.tensions: {len(frame.tensions)} values for the plant's "
                 f'{len(plant.tendon_names)} tendons ({", ".join(plant.tendon_names)})'
             )
+        _check_forces(f'{path}: keyframes.{k}.tensions', np.array(frame.tensions), plant)
     try:
         return Trajectory(
             Path(path).stem,
@@ -201,6 +202,15 @@ def _from_file(path: str, plant: PlantSettings) -> Trajectory:
         raise SettingsError(f'{path}: {error}') from None
 
 
+def _check_forces(where: str, tensions: np.ndarray, plant: PlantSettings) -> None:
+    """Refuse what the drives would cut off without a word."""
+    for name, tension, most in zip(plant.tendon_names, tensions, plant.max_forces, strict=True):
+        if tension > most:
+            raise SettingsError(
+                f"{where}: {name} pulls {tension:g} N, the plant's max_force is {most:g} N"
+            )
+
+
 def trajectory_names(robot: RobotDescription) -> tuple[str, ...]:
     """Trajectories known for this robot."""
     return tuple(TRAJECTORIES.get(robot.name, {}))
@@ -209,7 +219,9 @@ def trajectory_names(robot: RobotDescription) -> tuple[str, ...]:
 def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
     rows = _ENGINE[name]
     curvature = np.array([row[2:] for row in rows])  # (M, modules, 2)
-    moments = plant.EI * curvature + _level_moments(robot, plant)
+    moments = plant.EI * curvature
+    if len(plant.tendons) == moments.shape[1]:  # else refused below, with what there is
+        moments = moments + _level_moments(robot, plant)
     return Trajectory(
         name,
         np.array([row[0] for row in rows]),

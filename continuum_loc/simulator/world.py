@@ -15,8 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import heapq
+import logging
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, get_args, TYPE_CHECKING
 
 from continuum_loc.measurements import Measurement, NANOSECONDS, TruthSample
 from continuum_loc.robot import RobotDescription, Sensor
@@ -31,7 +32,12 @@ from continuum_loc.simulator.model import (
     settle,
 )
 from continuum_loc.simulator.motion import backbone, Motion, segment_strain, State
-from continuum_loc.simulator.plant import load_plant, node_arclengths, PlantSettings
+from continuum_loc.simulator.plant import (
+    bundled_plants,
+    load_plant,
+    node_arclengths,
+    PlantSettings,
+)
 from continuum_loc.simulator.trajectories import Trajectory, trajectory
 import numpy as np
 
@@ -42,6 +48,8 @@ TRUTH_RATE = 100.0
 ENCODER_RATE = 50.0
 ENCODER_SIGMA = 1e-4  # m, tendon displacement
 DEFAULT_START = NANOSECONDS
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,13 +90,18 @@ class World:
             faults,
             start_stamp,
         )
-        self.plant = plant if isinstance(plant, PlantSettings) else load_plant(plant or robot.name)
+        self.plant = plant if isinstance(plant, PlantSettings) else _plant(plant, robot)
         self.trajectory = _resolve(trajectory, robot, self.plant)
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
+        _check_fidelity(tof_fidelity)
         self.tof_fidelity = tof_fidelity
         model = build_model(robot, self.plant, scene, profile, self.trajectory.supported)
         self.body = _Body(robot, self.plant, model, self.trajectory)
         self.motion = Motion()
+        if scene is not None:
+            from continuum_loc.simulator.placement import check_start
+
+            check_start(robot, scene, self.nodes_s, *self.body.straight())
 
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
         """
@@ -96,8 +109,11 @@ class World:
 
         The default is the trajectory's duration.
 
-        Every call starts again from rest. Raises model.SimulationDiverged.
+        Every call starts again from rest. Raises SettingsError for a duration that is none, and
+        model.SimulationDiverged.
         """
+        if duration is not None and not 0.0 < duration < np.inf:
+            raise SettingsError(f'duration {duration} s: must be finite and greater than 0')
         stream = self._run(self.trajectory.duration if duration is None else duration)
         for fault in self.faults:
             stream = fault(stream)
@@ -245,19 +261,31 @@ class _Body:
         self.straight_length = self.data.ten_length.copy()
         self._steps = 0
 
+    def straight(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (N, 3) of the nodes of the straight robot, and how deep each touches (N,) [m]."""
+        mujoco, model, data = self._mujoco, self.model, self.data
+        self._start_straight()
+        mujoco.mj_forward(model, data)
+        depth = np.zeros(model.nbody)
+        for bodies in model.geom_bodyid[data.contact.geom].T:
+            np.maximum.at(depth, bodies, -data.contact.dist)
+        return data.xpos[self._nodes].copy(), depth[self._nodes]
+
+    def _start_straight(self) -> None:
+        self._mujoco.mj_resetData(self.model, self.data)
+        self._command(0.0)
+        if self._slides:
+            self.data.qpos[0] = self.data.ctrl[0]
+
     def settle(self) -> None:
         """
         Bring the robot to rest under the first command, from straight.
 
         Time 0 is then the trajectory's start.
         """
-        mujoco, model, data = self._mujoco, self.model, self.data
-        mujoco.mj_resetData(model, data)
-        self._command(0.0)
-        if self._slides:
-            data.qpos[0] = data.ctrl[0]
-        settle(model, data)
-        data.time = 0.0
+        self._start_straight()
+        settle(self.model, self.data)
+        self.data.time = 0.0
         self._steps = 0
 
     def resting_states(self) -> list[State]:
@@ -313,6 +341,22 @@ class _Body:
         return float((T_map_node[0, :3, 3] - base.pos) @ R.reshape(3, 3)[:, 0])
 
 
+def _check_fidelity(name: str) -> None:
+    from continuum_loc.simulator.tof import Fidelity
+
+    if name not in get_args(Fidelity):
+        raise SettingsError(f"no ToF fidelity '{name}': give {' or '.join(get_args(Fidelity))}")
+
+
+def _plant(name: str | Path | None, robot: RobotDescription) -> PlantSettings:
+    if name is None and robot.name not in bundled_plants():
+        raise SettingsError(
+            f"robot '{robot.name}' has no plant (stiffness, mass, tendons) among the bundled "
+            f'ones, {", ".join(bundled_plants())}: give your own (--plant my_plant.yaml)'
+        )
+    return load_plant(name or robot.name)
+
+
 def _resolve(path: str | Trajectory, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
     path = trajectory(path, robot, plant) if isinstance(path, str) else path
     tendons = len(plant.tendon_names)
@@ -322,6 +366,14 @@ def _resolve(path: str | Trajectory, robot: RobotDescription, plant: PlantSettin
             f'the plant has {tendons}'
         )
     least, most = robot.base.insertion.range
+    if most - least > robot.length:
+        _log.warning(
+            "robot '%s': its base travels %g m, farther than its length of %g m; the drive behind "
+            'the base touches nothing in the simulation',
+            robot.name,
+            most - least,
+            robot.length,
+        )
     if path.insertion.min() < least - 1e-9 or path.insertion.max() > most + 1e-9:
         raise SettingsError(
             f"trajectory '{path.name}' inserts {path.insertion.min()} to "

@@ -3,8 +3,8 @@ The simulator against mechanics, its sensors against their models, and its speed
 
 Statics against closed forms and a Cosserat rod, convergence in the number of links, the first mode
 and the damping that the integrator adds; the distribution of every sensor's noise; gyro,
-accelerometer and strain against the true motion; contact; and the real-time factor of the live
-engine robot.
+accelerometer and strain against the true motion; contact, and how far contact pieces stand out;
+and the real-time factor of the live engine robot.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 from continuum_loc import lie
-from continuum_loc.evaluation.studies import _vl53l5cx
+from continuum_loc.evaluation.studies import _pieces, _vl53l5cx
 from continuum_loc.evaluation.study import at_least, at_most, between, Claim, write_study
 from continuum_loc.measurements import (
     EncoderSample,
@@ -39,11 +39,15 @@ COSSERAT_LINKS = 24
 # strip.
 RODS = {'steel wire 1 mm': (9.8e-3, 6.2e-3), 'TPU rod 10 mm': (1.5e-2, 9.4e-2)}
 ROD_LENGTH = 0.3
+# GJ / EI: of round rods 1 / (1 + nu), nu 0.3 for steel and 0.48 for TPU; and near both bounds.
+TORSION = (0.2, 1.0 / 1.48, 1.0 / 1.3, 1.7)
+SURFACE = 7.0  # greatest distance of the engine's own contact pieces from its surface [mm]
 FALSE_ALARM = 1e-3  # of each noise test
 # Greatest penetration [mm]: the engine robot leans; the soft arm is swung against rigid objects at
 # a metre a second, and is 76 mm thick.
 PENETRATION = {'S': 5.0, 'R': 10.0}
 TINY = 1e-12
+_GREATEST = 'stands out, greatest [mm]'
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
@@ -54,6 +58,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     """
     statics = [*_statics((12, 24, 50) if quick else (6, 12, 24, 50, 100, 150))]
     shapes = [*_shapes(3 if quick else 20, seed)]
+    twisted = [*_torsion(1 if quick else 4, seed)]
     vibration = [first_mode(24, step) for step in (0.002, 0.005)]
     noise = [*_noise(seed), *_vl53l5cx.noise(seed)]
     motion = [
@@ -63,10 +68,12 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
         ),
         *_contact('soft_arm', [('R1', 'b6'), ('R2', 'b7'), ('R3', 'b8')], quick),
     ]
+    pieces = _pieces.contact_pieces(quick)
     speed = real_time_factor(3.0 if quick else 20.0, seed)
     claims = [
         *_statics_claims(statics),
         *_shape_claims(shapes),
+        *_torsion_claims(twisted),
         *_vibration_claims(vibration),
         *(
             at_least(f'p-value of the {row["sensor"]} noise', row['p_value'], '', FALSE_ALARM)
@@ -74,6 +81,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
         ),
         *_mechanism_claims(_vl53l5cx.mechanisms(seed)),
         *_motion_claims(motion),
+        *_pieces_claims(pieces),
         at_least(
             'real-time factor, live engine, contacts, 16 ToF in vl53l5cx, one core', speed, '', 1.5
         ),
@@ -86,6 +94,8 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
         tables={
             'statics': statics,
             'shapes': shapes,
+            'torsion': twisted,
+            'pieces': pieces,
             'vibration': vibration,
             'noise': noise,
             'motion': motion,
@@ -199,6 +209,54 @@ def _shape_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
             mean,
             'mm',
             0.3,
+        )
+
+
+def _torsion(cases: int, seed: int) -> Iterator[dict[str, Any]]:
+    """
+    Tip rotations against the Cosserat rod where GJ is not EI.
+
+    Loads at the tip; they turn it by the rod's torsion, which does not move it.
+    """
+    rng = np.random.default_rng(seed)
+    stiffness, mass = RODS['steel wire 1 mm']
+    for ratio in TORSION:
+        model = uniform_rod(
+            COSSERAT_LINKS, ROD_LENGTH, stiffness, mass, GJ=ratio * stiffness, supported=True
+        )
+        for _ in range(cases):
+            force = rng.normal(0.0, 0.5 * stiffness / ROD_LENGTH**2, 3)
+            moment = rng.normal(0.0, 0.3 * stiffness / ROD_LENGTH, 3)
+            expected, without = (
+                cosserat_shape(
+                    [ROD_LENGTH],
+                    ROD_LENGTH,
+                    stiffness,
+                    GJ,
+                    tip_force=force,
+                    tip_moment=moment,
+                )[0, :3, :3]
+                for GJ in (ratio * stiffness, stiffness)
+            )
+            tip = settled_tip(model, force, moment)[:3, :3]
+            yield {
+                'GJ / EI': ratio,
+                'GJ turns the tip by [deg]': float(lie.rotation_error_deg(expected, without)),
+                'tip error [deg]': float(lie.rotation_error_deg(tip, expected)),
+            }
+
+
+def _torsion_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
+    for ratio in TORSION:
+        errors, turns = (
+            np.mean([row[key] for row in rows if row['GJ / EI'] == ratio])
+            for key in ('tip error [deg]', 'GJ turns the tip by [deg]')
+        )
+        yield at_most(
+            f'GJ / EI = {ratio:.2f}: tip rotation error, of the {turns:.1f} deg that GJ makes',
+            100.0 * errors / turns,
+            '%',
+            3.0,
         )
 
 
@@ -443,6 +501,22 @@ def _motion_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
         )
         if row['scene'] != 'S0':
             yield at_least(f'time in contact, {where}', row['in contact [%]'], '%', 0.1)
+
+
+def _pieces_claims(rows: list[dict[str, Any]]) -> Iterator[Claim]:
+    own, _, cut = rows
+    yield at_most(
+        "S0's own contact pieces, short of the casing, stand out of its surface by",
+        own[_GREATEST],
+        'mm',
+        SURFACE,
+    )
+    yield at_most(
+        f'{cut["pieces"]} pieces cut from S0 as one mesh stand out of its surface by',
+        cut[_GREATEST],
+        'mm',
+        cut['tolerance [mm]'] + 1e3 * _pieces.ROUNDING,
+    )
 
 
 def real_time_factor(duration: float, seed: int = 0, fidelity: str = 'vl53l5cx') -> float:
