@@ -3,6 +3,7 @@
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
 from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.clocks import ClockEvidence
 from continuum_loc.estimator.factors.gyro import judge
 from continuum_loc.estimator.output import rattle_covariance
 from continuum_loc.estimator.state import Grid
@@ -162,3 +163,18 @@ def test_a_drawn_base_keeps_the_spread_of_the_description():
     shift = (lie.inverse(base.T_map_base) @ moved)[:, :3, 3]
     np.testing.assert_allclose(shift.std(axis=0), sigma, rtol=0.15)
     np.testing.assert_array_equal(moved[7], _base_drawn(description, 7).base.T_map_base)
+
+
+def test_an_offset_beyond_the_first_order_is_no_clock():
+    """Half a second is what a hit body's residuals ask for; its neighbour's 50 ms are told."""
+    information = np.array([2e4, 3e4])
+    evidence = ClockEvidence(
+        ['struck', 'late'],
+        information * np.array([-0.5, 0.05]),
+        information,
+        np.zeros((2, 2)),
+        np.ones(2),
+    )
+    told = evidence.offsets([('struck',), ('late',)], 0.025, 5.0)
+    assert [one.sensors for one in told] == [('late',)]
+    assert told[0].offset == pytest.approx(-0.05)

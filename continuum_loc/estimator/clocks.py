@@ -20,6 +20,7 @@ from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.window import Window
 import numpy as np
 
+MOST_OFFSET = 0.2  # [s] beyond a knot or so, residuals that are linear in time say nothing
 LEAST_INFORMATION = 1.0  # [1/s^2]: a sigma of a second says nothing
 
 
@@ -67,7 +68,8 @@ class ClockEvidence:
 
         One wrong clock drags the body along, so that its neighbours' seem wrong too: the most
         certain offset is taken first, and eliminated before the others are looked at again. One
-        that is certain only because its residuals exceed their noise is eliminated and not told.
+        that is certain only because its residuals exceed their noise, or larger than any that the
+        first order describes, is eliminated and not told.
         """
         g, information = self.gradient, np.diag(self.own) - self.taken
         found: list[ClockOffset] = []
@@ -78,7 +80,7 @@ class ClockEvidence:
                 break
             member = self._members(best.sensors)
             inflation = np.sqrt(max(member @ self.spread / member.sum(), 1.0))
-            if best.sigmas >= sigmas * inflation:
+            if best.sigmas >= sigmas * inflation and abs(best.offset) <= MOST_OFFSET:
                 found.append(replace(best, sigma=best.sigma * inflation))
             coupled = information @ member
             g = g + coupled * best.offset

@@ -116,16 +116,18 @@ class GyroFactor(Factor):
             omega,
             self.grid.bias_offset,
         )
-        weight = self._weight * self._shares()
+        samples = np.maximum(np.bincount(imus, minlength=number), 1)
+        spread = self._weight * squared / (3.0 * samples)
+        robust = self._weight / (1.0 + spread / self.settings.gyro.cauchy**2)
+        weight = robust * self._shares()
         # What no offset explains of the rates may be more than noise: a body that rattles.
         unexplained = squared - gradient**2 / np.maximum(information, 1e-12)
-        samples = np.maximum(np.bincount(imus, minlength=number), 1)
         return ClockScores(
             list(self._imus),
             weight * gradient,
             weight * information,
             weight * coupling,
-            self._weight * unexplained / (3.0 * samples),
+            robust * unexplained / (3.0 * samples),
         )
 
     def _judge(
