@@ -100,6 +100,7 @@ class Process:
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'OMP_NUM_THREADS': '1',
             'PYTHONUNBUFFERED': '1',
+            'PYTHONFAULTHANDLER': '1',
         }
         with self.path.open('w') as log:
             self.popen = subprocess.Popen(
@@ -134,10 +135,15 @@ class Process:
         """Signal the node and wait; its exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(how)
-        return self.popen.wait(PATIENCE)
+        return self.wait()
 
     def wait(self) -> int:
-        return self.popen.wait(PATIENCE)
+        """Wait for the node's end; its exit code. One that hangs says where."""
+        if not wait_until(lambda: self.popen.poll() is not None):
+            self.popen.send_signal(signal.SIGABRT)
+            self.popen.wait()
+            raise AssertionError(f'the node did not end:\n{self.log}')
+        return self.popen.returncode
 
 
 class Client:
