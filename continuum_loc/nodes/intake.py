@@ -130,12 +130,13 @@ class Early:
 
     /clock comes by a queue of its own, which reception may empty after those of the data, and at
     a high rate of play the tolerance of stamps is a very short time. So such a message waits until
-    the clock has come near its stamp, but `patience` seconds of real time at most.
+    the clock has come near its stamp, but `patience` seconds of real time at most from when it was
+    taken in.
     """
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
-        self._waiting: dict[int, Queued] = {}  # by order of arrival
+        self._waiting: dict[int, tuple[float, Queued]] = {}  # since when, by order of arrival
         self._by_stamp: list[tuple[int, int]] = []  # a heap of (stamp, order of arrival)
 
     def __len__(self) -> int:
@@ -154,7 +155,7 @@ class Early:
             if not queued.arrival or queued.stamp <= queued.arrival + nanoseconds(tolerance):
                 free.append(queued)
             else:
-                self._waiting[queued.place[1]] = queued
+                self._waiting[queued.place[1]] = time.monotonic(), queued
                 heapq.heappush(self._by_stamp, (queued.stamp, queued.place[1]))
         return [one._replace(arrival=clock) for one in self._released(latest)] + free
 
@@ -164,11 +165,11 @@ class Early:
         while self._by_stamp and (
             self._by_stamp[0][0] <= latest or self._by_stamp[0][1] not in self._waiting
         ):
-            queued = self._waiting.pop(heapq.heappop(self._by_stamp)[1], None)
-            free += [] if queued is None else [queued]
+            found = self._waiting.pop(heapq.heappop(self._by_stamp)[1], None)
+            free += [] if found is None else [found[1]]
         before = time.monotonic() - self._patience
-        while self._waiting and next(iter(self._waiting.values())).received < before:
-            free.append(self._waiting.pop(next(iter(self._waiting))))
+        while self._waiting and next(iter(self._waiting.values()))[0] < before:
+            free.append(self._waiting.pop(next(iter(self._waiting)))[1])
         return free
 
 

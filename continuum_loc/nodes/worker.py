@@ -33,7 +33,7 @@ T = TypeVar('T')
 OK, WARN, ERROR, STALE = range(4)
 POLL = 0.1  # s; how often an idle worker looks whether it has to stop
 STALE_AFTER = 2.0  # s without data
-CLOCK_PATIENCE = 1.0  # s; how long a message waits for a simulated clock that is behind it
+CLOCK_PATIENCE = 3.0  # s; how long a message waits for a simulated clock that is behind it
 # [s] older stamps come from a bag played without its clock, and say nothing about latency.
 PLAUSIBLE_LATENCY = 30.0
 
