@@ -47,11 +47,20 @@ class Domain:
 
 def _taken() -> tuple[int, IO[str]]:
     for number in DOMAINS:
-        file = Path(tempfile.gettempdir(), f'continuum_loc_domain_{number}.lock').open('a')
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-            continue
-        return number, file
+        file = _locked(Path(tempfile.gettempdir(), f'continuum_loc_domain_{number}.lock'))
+        if file is not None:
+            return number, file
     raise DomainError(f'all {len(DOMAINS)} ROS domains are taken by other graphs')
+
+
+def _locked(path: Path) -> IO[str] | None:
+    try:
+        file = path.open('a')
+    except PermissionError:  # another user's
+        return None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        return None
+    return file
