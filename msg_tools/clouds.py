@@ -45,11 +45,17 @@ def columns_cloud(make: Messages, header: Any, columns: dict[str, np.ndarray]) -
             rows[:, number] = column[part]
         finite = np.isfinite(rows)
         dense = dense and bool(finite.all() or finite[:, places].all())
-    return _cloud(make, header, (1, count), dtype, data, dense)
+    return _cloud(make, header, (1, count), dtype, data, dense, **make.uncopied)
 
 
 def _cloud(
-    make: Messages, header: Any, shape: tuple[int, int], dtype: np.dtype, data: Any, dense: bool
+    make: Messages,
+    header: Any,
+    shape: tuple[int, int],
+    dtype: np.dtype,
+    data: Any,
+    dense: bool,
+    **how: Any,
 ) -> Any:
     fields = [
         make(
@@ -72,6 +78,7 @@ def _cloud(
         row_step=dtype.itemsize * shape[1],
         data=data,
         is_dense=dense,
+        **how,
     )
 
 

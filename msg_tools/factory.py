@@ -25,13 +25,15 @@ class Messages:
 
     resolve: message class of a full type name such as `sensor_msgs/msg/Imu`.
     octets, doubles: turn an array into what the flavour wants in a `uint8[]` or a `float64[]` of
-    free length. blank: that many octets, to be written in place.
+    free length. blank: that many octets, to be written in place. uncopied: what a message is made
+    with in order to take over such octets as they are.
     """
 
     resolve: Callable[[str], type]
     octets: Callable[[np.ndarray], Any]
     doubles: Callable[[np.ndarray], Any]
     blank: Callable[[int], Any]
+    uncopied: dict[str, Any]
 
     def __call__(self, type_name: str, **fields: Any) -> Any:
         """Make a message with all its fields given."""
@@ -54,6 +56,7 @@ def ros_messages() -> Messages:
         lambda a: array.array('B', a.tobytes()),
         lambda a: array.array('d', a.tobytes()),
         lambda size: array.array('B', b'\0') * size,
+        {'check_fields': True},  # what rclpy's messages do not check they copy
     )
 
 
@@ -74,6 +77,7 @@ def bag_messages() -> Messages:
         lambda a: np.frombuffer(a.tobytes(), np.uint8),
         np.ascontiguousarray,
         lambda size: np.zeros(size, np.uint8),
+        {},
     )
 
 
