@@ -67,6 +67,18 @@ def test_topics_torn_apart_by_a_backlog_are_merged_again_by_stamp():
     assert (np.diff(stamps) >= -1000).all()  # strain's stamp is a float of seconds
 
 
+def test_topics_are_merged_by_stamp_while_a_simulated_clock_stands():
+    """All of them arrive at one time then, and one topic after the other."""
+    inbox, tick = Inbox(IntakeSettings()), SECOND // 50
+    for sensor in ('ring1_imu', 'ring2_imu'):
+        for number in range(20):
+            topic = 'imu/data_raw' if sensor == 'ring1_imu' else 'joint_states'
+            inbox.put(topic, _imu(START + number * tick, sensor), START)
+    left = list(iter(lambda: inbox.take(0.0), None))
+    assert [one.stamp for one in left] == sorted(one.stamp for one in left)
+    assert len({one.stamp for one in left}) == 20
+
+
 def test_messages_leave_in_the_order_of_arrival_across_topics():
     inbox = Inbox(IntakeSettings())
     sent = [

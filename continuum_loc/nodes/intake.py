@@ -45,8 +45,8 @@ class Queued(NamedTuple):
 
     Its place, topic, message, ROS time (ns) and monotonic time (s) of arrival.
 
-    place: stamp (ns), or the arrival where that is earlier, as stamps from the future must not
-    hold up others; then the order of arrival.
+    place: stamp (ns), or the arrival where the stamp is too far ahead of it, as stamps from the
+    future must not hold up others; then the order of arrival.
     """
 
     place: tuple[int, int]
@@ -86,7 +86,9 @@ class Inbox:
         kind = TRACKER if topic.startswith(TRACKER) else topic
         with self._ready:
             self.received[topic] += 1
-            place = (min(rough_stamp(message, arrival), arrival), self._order)
+            stamp = rough_stamp(message, arrival)
+            ahead = stamp > arrival + nanoseconds(self.settings.future_tolerance)
+            place = (arrival if ahead else stamp, self._order)
             self._queues[kind].append(Queued(place, topic, message, arrival, time.monotonic()))
             self._order += 1
             self._size += 1
