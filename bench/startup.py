@@ -99,14 +99,17 @@ def _peak_memory(pid: int) -> int:
 
 
 def _started(command: list[str]) -> subprocess.Popen:
-    alone_in_its_graph = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100)}
-    return subprocess.Popen(
-        [sys.executable, *command],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=alone_in_its_graph,
-    )
+    from continuum_loc.nodes.domain import Domain
+
+    with Domain() as alone:  # which the process holds as long as it lives
+        return subprocess.Popen(
+            [sys.executable, *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, 'ROS_DOMAIN_ID': str(alone.number)},
+            pass_fds=(alone.lock,),
+        )
 
 
 if __name__ == '__main__':

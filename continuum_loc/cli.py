@@ -379,6 +379,9 @@ def evaluate(
     ] = None,
     seed: Seed = 0,
     jobs: Annotated[int, typer.Option(help='processes', min=1)] = 1,
+    minutes: Annotated[
+        float | None, typer.Option(help='with `soak`: how long, instead of half an hour', min=0.5)
+    ] = None,
     scheduler: Annotated[
         str, typer.Option(help='address of a Dask scheduler to run the trials on')
     ] = '',
@@ -407,15 +410,20 @@ def evaluate(
         return
     if name == 'bags' and (folder is None or map_file is None):
         raise typer.BadParameter('bags needs a folder and a map: evaluate bags DIR --map FILE')
+    if minutes is not None and name != 'soak':
+        raise typer.BadParameter('--minutes goes with soak')
     run = None if name == 'bags' else load_study(name)
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
     SCHEDULER.set(scheduler)
-    claims = (
-        run(out, quick, seed, jobs)
-        if run
-        else _evaluate_bags(folder, robot, map_file, settings, out, jobs)
-    )
+    if run is None:
+        claims = _evaluate_bags(folder, robot, map_file, settings, out, jobs)
+    elif minutes is not None:
+        from continuum_loc.evaluation.studies.soak import soak
+
+        claims = soak(out, 60.0 * minutes, seed)
+    else:
+        claims = run(out, quick, seed, jobs)
     console.print(_claims_table(claims))
     for trial, error in _failed(out, name).items():
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)

@@ -14,6 +14,9 @@ import numpy as np
 
 # sensor_msgs/PointField: datatype number -> NumPy scalar.
 DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+# Rows written at a time: a large cloud would else pass through the processor's cache once for each
+# column.
+ROWS = 4096
 _NUMBER = {np.dtype(code): number for number, code in DATATYPES.items()}
 
 
@@ -23,8 +26,37 @@ def cloud_message(make: Messages, header: Any, array: np.ndarray) -> Any:
 
     Fields are those of the dtype.
     """
-    height, width = array.shape if array.ndim == 2 else (1, len(array))
-    dtype = array.dtype
+    shape = array.shape if array.ndim == 2 else (1, len(array))
+    dense = all(bool(np.isfinite(array[name]).all()) for name in 'xyz')
+    return _cloud(make, header, shape, array.dtype, make.octets(array), dense)
+
+
+def columns_cloud(make: Messages, header: Any, columns: dict[str, np.ndarray]) -> Any:
+    """PointCloud2 of columns (N,), x, y and z among them, as float32; written in place."""
+    dtype = np.dtype([(name, '<f4') for name in columns])
+    count = len(columns['x'])
+    data = make.blank(count * dtype.itemsize)
+    table = np.frombuffer(data, '<f4').reshape(count, len(columns))
+    places, dense = [list(columns).index(name) for name in 'xyz'], True
+    for begin in range(0, count, ROWS):
+        part = slice(begin, begin + ROWS)
+        rows = table[part]
+        for number, column in enumerate(columns.values()):
+            rows[:, number] = column[part]
+        finite = np.isfinite(rows)
+        dense = dense and bool(finite.all() or finite[:, places].all())
+    return _cloud(make, header, (1, count), dtype, data, dense, **make.uncopied)
+
+
+def _cloud(
+    make: Messages,
+    header: Any,
+    shape: tuple[int, int],
+    dtype: np.dtype,
+    data: Any,
+    dense: bool,
+    **how: Any,
+) -> Any:
     fields = [
         make(
             'sensor_msgs/msg/PointField',
@@ -35,18 +67,18 @@ def cloud_message(make: Messages, header: Any, array: np.ndarray) -> Any:
         )
         for name in dtype.names
     ]
-    dense = bool(all(np.isfinite(array[name]).all() for name in 'xyz'))
     return make(
         'sensor_msgs/msg/PointCloud2',
         header=header,
-        height=height,
-        width=width,
+        height=shape[0],
+        width=shape[1],
         fields=fields,
         is_bigendian=False,
         point_step=dtype.itemsize,
-        row_step=dtype.itemsize * width,
-        data=make.octets(array),
+        row_step=dtype.itemsize * shape[1],
+        data=data,
         is_dense=dense,
+        **how,
     )
 
 

@@ -26,7 +26,7 @@ from continuum_loc.measurements import (
     TrackedPose,
     TruthSample,
 )
-from msg_tools.clouds import cloud_array, cloud_message
+from msg_tools.clouds import cloud_array, cloud_message, columns_cloud
 from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord, TipRecord
@@ -552,11 +552,7 @@ def tip_record(message: Any, where: str = 'tip') -> TipRecord:
 
 def columns_message(make: Messages, cloud: CloudRecord, frame_id: str = MAP) -> Any:
     """PointCloud2 of named columns, float32."""
-    names = list(cloud.fields)
-    array = np.zeros(len(cloud.fields['x']), np.dtype([(name, '<f4') for name in names]))
-    for name in names:
-        array[name] = cloud.fields[name]
-    return cloud_message(make, header_message(make, cloud.stamp, frame_id), array)
+    return columns_cloud(make, header_message(make, cloud.stamp, frame_id), cloud.fields)
 
 
 def cloud_record(message: Any, where: str = 'cloud') -> CloudRecord:

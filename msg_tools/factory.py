@@ -25,12 +25,15 @@ class Messages:
 
     resolve: message class of a full type name such as `sensor_msgs/msg/Imu`.
     octets, doubles: turn an array into what the flavour wants in a `uint8[]` or a `float64[]` of
-    free length.
+    free length. blank: that many octets, to be written in place. uncopied: what a message is made
+    with in order to take over such octets as they are.
     """
 
     resolve: Callable[[str], type]
     octets: Callable[[np.ndarray], Any]
     doubles: Callable[[np.ndarray], Any]
+    blank: Callable[[int], Any]
+    uncopied: dict[str, Any]
 
     def __call__(self, type_name: str, **fields: Any) -> Any:
         """Make a message with all its fields given."""
@@ -49,7 +52,11 @@ def ros_messages() -> Messages:
     # An array.array is taken over as a block; an ndarray would be copied element by element (up to
     # 3 ms a cloud).
     return Messages(
-        resolve, lambda a: array.array('B', a.tobytes()), lambda a: array.array('d', a.tobytes())
+        resolve,
+        lambda a: array.array('B', a.tobytes()),
+        lambda a: array.array('d', a.tobytes()),
+        lambda size: array.array('B', b'\0') * size,
+        {'check_fields': True},  # what rclpy's messages do not check they copy
     )
 
 
@@ -66,7 +73,11 @@ def bag_messages() -> Messages:
     """Messages of rosbags' type store, which bags are written from and read into."""
     types = typestore().types
     return Messages(
-        types.__getitem__, lambda a: np.frombuffer(a.tobytes(), np.uint8), np.ascontiguousarray
+        types.__getitem__,
+        lambda a: np.frombuffer(a.tobytes(), np.uint8),
+        np.ascontiguousarray,
+        lambda size: np.zeros(size, np.uint8),
+        {},
     )
 
 

@@ -6,6 +6,7 @@ Only a change does. To search anew: HYPOTHESIS_PROFILE=explore make test.
 
 import os
 import re
+import sys
 
 from hypothesis import settings
 import pytest
@@ -27,3 +28,11 @@ def pytest_pycollect_makemodule(module_path, parent):
     if re.search(r'^from (rclpy|node_graph)\b', module_path.read_text(), re.MULTILINE):
         return NodeModule.from_parent(parent, path=module_path)
     return None
+
+
+@pytest.fixture(scope='module', autouse=True)
+def nothing_left_behind():
+    """Nodes of a failed test would go on, and take the processor from the tests that follow."""
+    yield
+    if 'node_graph' in sys.modules:
+        sys.modules['node_graph'].clean_up()

@@ -6,13 +6,11 @@ Nodes as processes on a graph of their own, and a client that talks to them.
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 
 from continuum_loc.measurements import (
@@ -22,11 +20,13 @@ from continuum_loc.measurements import (
     StrainSample,
     TofFrame,
 )
+from continuum_loc.nodes.domain import Domain
 from continuum_loc.nodes.runtime import output_qos
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.topics import topic_spec
 import numpy as np
+from rcl_interfaces.srv import GetParameters
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -34,8 +34,8 @@ from rclpy.node import Node
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 60.0  # s; generous: discovery alone may take seconds, and the machine may be busy
+ANSWER = 5.0  # s; a service that has not answered by then is asked again
 COMPILING = 240.0  # s; where nothing has been compiled before, and the machine is busy
-_held: list = []
 
 ROBOT = """
 name: stub
@@ -54,22 +54,27 @@ imu: [{name: imu1, ring: ring1}, {name: imu2, ring: ring2}]
 BOX = np.array([[-0.2, -0.3, -0.3], [0.6, 0.3, 0.3]])
 
 
-# [s] the other side learns of a subscription about when this side learns of the publisher.
-MATCHED = 0.5
+_domains: dict[int, Domain] = {}
+_running: list[Process] = []
 
 
 def fresh_domain() -> int:
-    """Return a ROS_DOMAIN_ID that no other test has, of this run or of another on this machine."""
-    for number in range(1, 102):
-        lock = Path(tempfile.gettempdir(), f'continuum_loc_domain_{number}.lock').open('w')
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            continue
-        _held.append(lock)  # until this run ends
-        return number
-    raise RuntimeError('all 101 ROS domains are taken by other test runs')
+    """Return a ROS_DOMAIN_ID that no other graph has; it is kept until `clean_up`."""
+    domain = Domain()
+    _domains[domain.number] = domain
+    return domain.number
+
+
+def clean_up() -> None:
+    """End what a failed test left running, and give the domains back."""
+    for process in _running:
+        if process.popen.poll() is None:
+            process.popen.kill()
+            process.popen.wait()
+    _running.clear()
+    for domain in _domains.values():
+        domain.close()
+    _domains.clear()
 
 
 def wait_until(condition, patience: float = PATIENCE, step=lambda: time.sleep(0.02)) -> bool:
@@ -95,6 +100,7 @@ class Process:
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'OMP_NUM_THREADS': '1',
             'PYTHONUNBUFFERED': '1',
+            'PYTHONFAULTHANDLER': '1',
         }
         with self.path.open('w') as log:
             self.popen = subprocess.Popen(
@@ -110,7 +116,10 @@ class Process:
                 stderr=subprocess.STDOUT,
                 cwd=folder,
                 env=environment,
+                # A node that outlives its test still holds the domain, and disturbs nobody.
+                pass_fds=(_domains[domain].lock,),
             )
+        _running.append(self)
 
     @property
     def log(self) -> str:
@@ -126,10 +135,15 @@ class Process:
         """Signal the node and wait; its exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(how)
-        return self.popen.wait(PATIENCE)
+        return self.wait()
 
     def wait(self) -> int:
-        return self.popen.wait(PATIENCE)
+        """Wait for the node's end; its exit code. One that hangs says where."""
+        if not wait_until(lambda: self.popen.poll() is not None):
+            self.popen.send_signal(signal.SIGABRT)
+            self.popen.wait()
+            raise AssertionError(f'the node did not end:\n{self.log}')
+        return self.popen.returncode
 
 
 class Client:
@@ -185,9 +199,11 @@ class Client:
         self.publisher(topic).publish(topic_spec(topic).encode(ros_messages(), item))
 
     def await_listeners(self, *topics: str, count: int = 1) -> None:
+        """Wait until `count` subscriptions hear these topics, and know that we say them."""
         assert self.until(
             lambda: all(self.publisher(t).get_subscription_count() >= count for t in topics)
         ), f'nobody listens to {topics}'
+        self._await_acquaintance(topics, self.node.get_subscriptions_info_by_topic)
 
     def await_speakers(self) -> None:
         """
@@ -198,14 +214,48 @@ class Client:
         assert self.until(
             lambda: all(self.node.count_publishers(topic) > 0 for topic in self.heard)
         ), f'nobody publishes one of {list(self.heard)}'
-        self.until(lambda: False, MATCHED)
+        self._await_acquaintance(self.heard, self.node.get_publishers_info_by_topic)
+
+    def _await_acquaintance(self, topics, endpoints) -> None:
+        """
+        Wait until the nodes at the other ends of these topics know of our ends.
+
+        DDS announces a participant's endpoints in the order of their making: a node that answers
+        a client made just now knows all that was made before. That this side has matched says
+        nothing about the other, which on a busy machine may follow seconds later.
+        """
+
+        def others() -> set[str]:
+            ends = [end for topic in topics for end in endpoints(self._full(topic))]
+            return {f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in ends}
+
+        def named() -> bool:  # the names come by a topic of their own
+            return not any('_UNKNOWN_' in name for name in others())
+
+        assert self.until(named), others()
+        for name in others():
+            if not name.endswith('/client'):  # another client of the test has no services
+                self.call(GetParameters, f'{name}/get_parameters', GetParameters.Request())
+
+    def _full(self, topic: str) -> str:
+        return self.node.resolve_topic_name(topic)
 
     def call(self, kind, name: str, request):
+        """
+        Ask a service until it answers.
+
+        rmw_fastrtps drops an answer where the server has not matched the client within 0.1 s.
+        """
         client = self.node.create_client(kind, name)
-        assert self.until(client.service_is_ready), f'no service {name}'
-        future = client.call_async(request)
-        assert self.until(future.done), f'service {name} does not answer'
-        return future.result()
+        try:
+            assert self.until(client.service_is_ready), f'no service {name}'
+            for _ in range(round(PATIENCE / ANSWER)):
+                future = client.call_async(request)
+                if self.until(future.done, ANSWER):
+                    return future.result()
+            raise AssertionError(f'service {name} does not answer')
+        finally:
+            self.node.destroy_client(client)
 
     def now(self) -> int:
         return self.node.get_clock().now().nanoseconds

@@ -144,6 +144,33 @@ def test_a_cache_that_overflows_changes_nothing():
     assert small.cache_use['cells'] <= 65
 
 
+def test_a_reserved_index_has_all_its_memory_and_takes_no_more_wherever_it_is_asked():
+    """
+    Memory is taken when it is written first: `reserve` writes all that lookups ever write.
+
+    That stays as large as it is, while lists come and go.
+    """
+    points, normals = wavy_cylinder(20_000, 10)
+    index = VoxelIndex(points, normals, cache_cells=1 << 12)
+    cache = [array for array in index.arrays if isinstance(array, np.ndarray)][-5:]
+    before = [array.copy() for array in cache]
+    slots, *untouched, _ = cache
+    for array in untouched:
+        array.fill(7)
+    index.reserve()
+    assert not any((array == 7).any() for array in untouched)
+    np.testing.assert_array_equal(slots, before[0])  # a table of -1, written when it was made
+    rng = np.random.default_rng(11)
+    for _ in range(4):
+        rows = rng.integers(0, len(points), 1500)
+        queries = points[rows] + 0.02 * rng.normal(size=(len(rows), 3))
+        for _ in range(PATIENCE + 1):
+            index.nearest_facing(queries, -normals[rows], 0.1, 0.3)
+    assert index.cache_use['emptied'] > 0 and index.cache_use['candidates'] > 1000
+    after = [array for array in index.arrays if isinstance(array, np.ndarray)][-5:]
+    assert all(one is other for one, other in zip(after, cache, strict=True))
+
+
 def test_copies_share_the_cloud_and_not_the_cache():
     index = VoxelIndex(wavy_cylinder(1000, 6)[0])
     twin = index.copy()

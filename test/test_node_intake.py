@@ -23,7 +23,7 @@ from continuum_loc.measurements import (
     TofFrame,
     TrackedPose,
 )
-from continuum_loc.nodes.intake import Inbox, Intake, SACRIFICE, StampGate
+from continuum_loc.nodes.intake import Early, Inbox, Intake, SACRIFICE, StampGate
 from continuum_loc.nodes.pacing import Paced
 from continuum_loc.nodes.settings import IntakeSettings
 from continuum_loc.nodes.warm_up import rest_samples
@@ -65,6 +65,18 @@ def test_topics_torn_apart_by_a_backlog_are_merged_again_by_stamp():
     ]
     assert len(left) == len(samples) + 1 and left[-1].message is lying
     assert (np.diff(stamps) >= -1000).all()  # strain's stamp is a float of seconds
+
+
+def test_topics_are_merged_by_stamp_while_a_simulated_clock_stands():
+    """All of them arrive at one time then, and one topic after the other."""
+    inbox, tick = Inbox(IntakeSettings()), SECOND // 50
+    for sensor in ('ring1_imu', 'ring2_imu'):
+        for number in range(20):
+            topic = 'imu/data_raw' if sensor == 'ring1_imu' else 'joint_states'
+            inbox.put(topic, _imu(START + number * tick, sensor), START)
+    left = list(iter(lambda: inbox.take(0.0), None))
+    assert [one.stamp for one in left] == sorted(one.stamp for one in left)
+    assert len({one.stamp for one in left}) == 20
 
 
 def test_messages_leave_in_the_order_of_arrival_across_topics():
@@ -111,6 +123,48 @@ def test_old_tof_frames_are_dropped_and_counted_while_all_else_is_kept():
     assert frames == list(range(10 - len(frames), 10)) and 1 <= len(frames) <= 4
     assert inbox.dropped == {'tof/points': 10 - len(frames)}
     assert [item.message for item in kept if item.topic == 'imu/data_raw'] == list(range(10))
+
+
+def test_messages_that_overtake_a_simulated_clock_wait_for_it():
+    """As a player's do at twice the speed: none is refused, none that is due waits behind them."""
+    early, queue = Early(patience=60.0), Inbox(IntakeSettings())
+    tick, tolerance = SECOND // 4, 0.2
+    for number in (4, 3, 2, 1, 0, -1):
+        queue.put('imu/data_raw', _imu(START + number * tick), START)
+    left = early.timely(list(iter(lambda: queue.take(0.0), None)), START, tolerance)
+    assert [one.stamp for one in left] == [START, START - tick] and len(early) == 4
+    assert early.timely([], START + tick // 10, tolerance) == []
+    left = early.timely([], START + 3 * tick, tolerance)
+    assert [one.stamp for one in left] == [START + number * tick for number in (1, 2, 3)]
+    intake = Intake(load_robot('engine'), IntakeSettings(), lambda kind, text: None)
+    assert all(intake.accept(one.topic, one.message, one.arrival) for one in left)
+
+
+def test_a_message_that_the_clock_never_comes_to_is_judged_in_the_end():
+    early, queue = Early(patience=0.05), Inbox(IntakeSettings())
+    for sensor in ('ring1_imu', 'ring2_imu'):
+        queue.put('imu/data_raw', _imu(START + 60 * SECOND, sensor), START)
+    assert early.timely([queue.take(0.0), queue.take(0.0)], START, 0.5) == []
+    time.sleep(0.06)
+    left = early.timely([], START + SECOND, 0.5)
+    assert [one.arrival for one in left] == [START + SECOND] * 2 and len(early) == 0
+    intake = Intake(load_robot('engine'), IntakeSettings(), lambda kind, text: None)
+    assert not any(intake.accept(one.topic, one.message, one.arrival) for one in left)
+    assert intake.refused == {'future stamp': 2}
+    assert early.timely([], START + 90 * SECOND, 0.5) == []
+
+
+def test_a_clock_that_jumps_back_or_has_not_begun_holds_nothing_up():
+    early, queue = Early(patience=60.0), Inbox(IntakeSettings())
+    for arrival in (START, 0):
+        queue.put('imu/data_raw', _imu(START), arrival)
+    sent = [queue.take(0.0), queue.take(0.0)]
+    assert len(early.timely(sent, START - 60 * SECOND, 0.5)) == 2 and len(early) == 0
+
+
+def _imu(stamp, sensor='ring1_imu'):
+    sample = ImuSample(stamp, sensor, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+    return topic_spec('imu/data_raw').encode(bag_messages(), sample)
 
 
 def test_nothing_is_lost_between_two_threads():

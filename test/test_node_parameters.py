@@ -9,11 +9,11 @@ from pathlib import Path
 
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes import parameters
+from continuum_loc.nodes.domain import Domain
 from continuum_loc.nodes.runtime import PackageNode
 from continuum_loc.nodes.settings import EstimatorNodeSettings
 from continuum_loc.nodes.write_config import config_text, NODES
 from continuum_loc.settings import SettingsError
-from node_graph import fresh_domain
 import pytest
 from rcl_interfaces.msg import ParameterType
 import rclpy
@@ -26,16 +26,16 @@ CONFIG = Path(__file__).resolve().parent.parent / 'config'
 
 @contextlib.contextmanager
 def node_of(defaults, *arguments, name='estimator'):
-    context = Context()
-    rclpy.init(context=context, domain_id=fresh_domain(), args=['--ros-args', *arguments])
-    node = None
-    try:
-        node = PackageNode(name, defaults, context=context)
-        yield node
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown(context=context)
+    context, node = Context(), None
+    with Domain() as domain:
+        rclpy.init(context=context, domain_id=domain.number, args=['--ros-args', *arguments])
+        try:
+            node = PackageNode(name, defaults, context=context)
+            yield node
+        finally:
+            if node is not None:
+                node.destroy_node()
+            rclpy.try_shutdown(context=context)
 
 
 @pytest.mark.parametrize('name', NODES)

@@ -6,7 +6,9 @@ A straight Hall + IMU arm at rest, then bent, from the analytic simulation.
 
 import signal
 
+from continuum_loc.nodes.shape import rehearse
 from continuum_loc.robot import load_robot
+from continuum_loc.shape import ShapeSettings
 from node_graph import Client, COMPILING, fresh_domain, Process
 import numpy as np
 import pytest
@@ -14,6 +16,15 @@ from std_srvs.srv import Trigger
 
 pytestmark = pytest.mark.timeout(300)
 OUTPUTS = ('shape/poses', 'shape/curve', '/diagnostics')
+
+
+@pytest.mark.parametrize('changed', [{}, {'position': 'joint'}, {'start': 'anyhow'}])
+def test_the_rehearsal_before_the_first_message_goes_as_far_as_an_estimate(changed):
+    """What it leaves out is compiled when data flows, half a minute of which is lost then."""
+    settings = ShapeSettings().model_copy(update=changed)
+    estimate = rehearse(load_robot('hall_arm'), settings)
+    assert estimate is not None and np.isfinite(estimate.T_map_module).all()
+    assert estimate.stamp > (settings.taring_seconds + settings.watch) * 1e9
 
 
 def test_the_simulated_arm_is_followed_live(tmp_path):

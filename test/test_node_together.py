@@ -1,6 +1,7 @@
 """Several robots, bags and clocks on one graph: nodes as processes, over real DDS."""
 
 from dataclasses import replace
+import json
 import signal
 
 import numpy as np
@@ -10,8 +11,11 @@ pytest.importorskip('rclpy', reason='rclpy is not installed')
 
 from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds, TrackedPose
 from msg_tools.bag import BagWriter
+from msg_tools.convert import time_message
+from msg_tools.factory import ros_messages
 from node_graph import BoxRobot, Client, COMPILING, fresh_domain, Process, wait_until
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
 pytestmark = pytest.mark.timeout(300)
 INPUTS = ('tof/points', 'imu/data_raw', 'strain', 'joint_states')
@@ -41,9 +45,7 @@ def estimator(folder, domain, *arguments, **parameters):
         folder,
         *arguments,
         settings='engine',
-        warm_up='false',
-        **{'intake.max_backlog': 30.0},
-        **parameters,
+        **{'warm_up': 'false', 'intake.max_backlog': 30.0} | parameters,
     )
     node.await_log('ready:', COMPILING)
     return node
@@ -79,6 +81,52 @@ def test_a_looped_bag_with_its_own_clock_is_estimated_anew_each_time_round(box, 
     clock = [record.stamp for record in diagnostics if record.stamp]
     assert clock and all(stamps[0] <= t <= stamps[-1] + 10**9 for t in clock)
     assert node.stop() == 0, node.log
+
+
+def test_data_that_overtake_their_clock_wait_for_it(box, tmp_path):
+    """As of a fast player: two seconds of data come while the clock still stands."""
+    stamps = [YESTERDAY + nanoseconds(tick / 15) for tick in range(1, 31)]
+    latest = YESTERDAY + nanoseconds(0.5)  # of what the tolerance lets pass
+    domain, summary = fresh_domain(), tmp_path / 'summary.json'
+    node = estimator(
+        tmp_path,
+        domain,
+        robot=box.path,
+        map=box.map,
+        use_sim_time='true',
+        diagnostics_rate=5.0,
+        summary_file=summary,
+        warm_up='true',  # nothing is to take the time that the clock is waited for
+        **{'intake.reliable_inputs': 'true'},
+    )
+    with Client(domain) as client:
+        clock = client.node.create_publisher(Clock, '/clock', 10)
+
+        def at(stamp):
+            clock.publish(Clock(clock=time_message(ros_messages(), stamp)))
+
+        poses, diagnostics = client.hear('poses'), client.hear('/diagnostics')
+        client.await_listeners(*INPUTS)
+        client.await_speakers()
+        at(YESTERDAY)
+        assert client.until(lambda: diagnostics and diagnostics[-1].stamp == YESTERDAY), node.log
+        sent = [(topic, sample) for stamp in stamps for topic, sample in box.samples(stamp)]
+        for topic, sample in sent:
+            client.send(topic, sample)
+        held = sum(sample.stamp > latest for _, sample in sent)
+
+        def standing():
+            values = diagnostics[-1].statuses[0][3]
+            return (values['received'], values['queue']) == (str(len(sent)), str(held))
+
+        assert client.until(standing), (diagnostics[-1], held, node.log)
+        assert all(pose.stamp <= latest for pose in poses)
+        at(stamps[-1])
+        assert client.until(lambda: poses and poses[-1].stamp == stamps[-1]), node.log
+    assert node.stop() == 0, node.log
+    counts = json.loads(summary.read_text())['counts']
+    assert counts['refused'] == {}, node.log
+    assert counts['used']['tof/points'] == len(stamps) * len(box.robot.tof)
 
 
 def test_two_robots_at_once_keep_to_themselves(box, tmp_path):

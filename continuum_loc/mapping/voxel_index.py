@@ -624,7 +624,8 @@ class VoxelIndex:
 
     def reserve(self) -> VoxelIndex:
         """Take the cache's memory at once, not in the course of a long run; return self."""
-        self.arrays.pool.fill(0.0)
+        for array in (self.arrays.pool, self.arrays.pool_normals, self.arrays.scratch):
+            array.fill(0)
         return self
 
     @property

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
+import heapq
 import threading
 import time
 from typing import Any, NamedTuple
@@ -44,8 +45,8 @@ class Queued(NamedTuple):
 
     Its place, topic, message, ROS time (ns) and monotonic time (s) of arrival.
 
-    place: stamp (ns), or the arrival where that is earlier, as stamps from the future must not
-    hold up others; then the order of arrival.
+    place: stamp (ns), or the arrival where the stamp is too far ahead of it, as stamps from the
+    future must not hold up others; then the order of arrival.
     """
 
     place: tuple[int, int]
@@ -53,6 +54,11 @@ class Queued(NamedTuple):
     message: Any
     arrival: int
     received: float
+
+    @property
+    def stamp(self) -> int:
+        """As far as it is known before it is checked [ns]."""
+        return rough_stamp(self.message, self.arrival)
 
 
 class Inbox:
@@ -80,7 +86,9 @@ class Inbox:
         kind = TRACKER if topic.startswith(TRACKER) else topic
         with self._ready:
             self.received[topic] += 1
-            place = (min(rough_stamp(message, arrival), arrival), self._order)
+            stamp = rough_stamp(message, arrival)
+            ahead = stamp > arrival + nanoseconds(self.settings.future_tolerance)
+            place = (arrival if ahead else stamp, self._order)
             self._queues[kind].append(Queued(place, topic, message, arrival, time.monotonic()))
             self._order += 1
             self._size += 1
@@ -116,6 +124,55 @@ class Inbox:
         self._queues[kind].popleft()
         self._size -= 1
         self.dropped[kind] += 1
+
+
+class Early:
+    """
+    Messages that a simulated clock has not come to yet.
+
+    /clock comes by a queue of its own, which reception may empty after those of the data, and at
+    a high rate of play the tolerance of stamps is a very short time. So such a message waits until
+    the clock has come near its stamp, but `patience` seconds of real time at most from when it was
+    taken in.
+    """
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._waiting: dict[int, tuple[float, Queued]] = {}  # since when, by order of arrival
+        self._by_stamp: list[tuple[int, int]] = []  # a heap of (stamp, order of arrival)
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def timely(self, new: list[Queued], clock: int, tolerance: float) -> list[Queued]:
+        """
+        Take messages in; give up those that may be judged, at `clock` (ns) and a tolerance [s].
+
+        Those that waited come first, by stamp, and count as having come just now. A message that
+        its own arrival does not make early never waits: a looped bag's clock jumps back.
+        """
+        free = []
+        latest = clock + nanoseconds(tolerance)
+        for queued in new:
+            if not queued.arrival or queued.stamp <= queued.arrival + nanoseconds(tolerance):
+                free.append(queued)
+            else:
+                self._waiting[queued.place[1]] = time.monotonic(), queued
+                heapq.heappush(self._by_stamp, (queued.stamp, queued.place[1]))
+        return [one._replace(arrival=clock) for one in self._released(latest)] + free
+
+    def _released(self, latest: int) -> list[Queued]:
+        """Messages stamped up to `latest` (ns), and those that waited in vain."""
+        free = []
+        while self._by_stamp and (
+            self._by_stamp[0][0] <= latest or self._by_stamp[0][1] not in self._waiting
+        ):
+            found = self._waiting.pop(heapq.heappop(self._by_stamp)[1], None)
+            free += [] if found is None else [found[1]]
+        before = time.monotonic() - self._patience
+        while self._waiting and next(iter(self._waiting.values()))[0] < before:
+            free.append(self._waiting.pop(next(iter(self._waiting)))[1])
+        return free
 
 
 def rough_stamp(message: Any, arrival: int) -> int:

@@ -18,6 +18,8 @@ import sys
 import time
 from typing import Any
 
+from continuum_loc.nodes.domain import Domain
+
 START_LIMIT = 180.0  # s; the first run compiles
 STOP_LIMIT = 30.0
 POLL = 0.1
@@ -54,7 +56,12 @@ class _Process:
     """One node: its log goes to a file, which is quoted when it fails."""
 
     def __init__(
-        self, node: str, parameters: dict[str, Any], folder: Path, environment: dict[str, str]
+        self,
+        node: str,
+        parameters: dict[str, Any],
+        folder: Path,
+        environment: dict[str, str],
+        domain: Domain,
     ) -> None:
         self.node, self.log = node, folder / f'{node}.log'
         arguments = [
@@ -67,7 +74,8 @@ class _Process:
                 [sys.executable, '-m', f'continuum_loc.nodes.{node}', '--ros-args', *arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=environment,
+                env=environment | {'ROS_DOMAIN_ID': str(domain.number)},
+                pass_fds=(domain.lock,),
                 start_new_session=True,
             )
 
@@ -127,7 +135,6 @@ def run_live(
     profile: str = 'live',
     tof_fidelity: str = 'paper',
     settings: str = '',
-    domain_id: int | None = None,
     record: bool = True,
     progress: Callable[[str, float], None] | None = None,
     watch: Callable[[dict[str, int]], None] | None = None,
@@ -136,15 +143,15 @@ def run_live(
     Simulate, estimate and record live over real ROS 2, `duration` seconds of data.
 
     The bag is `folder`/bag; `record` says whether there is one.
-    robot, scene, prior_map, settings: bundled names or files. domain_id: ROS_DOMAIN_ID of the
-    private graph (default: one from the process id). progress(stage, share): called as it goes on,
-    share in [0, 1]. watch(process ids by node): called ten times a second while data flows. Raises
-    LiveError where a node fails; no process is left behind.
+    The graph has a ROS domain that nobody else uses (`Domain`).
+    robot, scene, prior_map, settings: bundled names or files. progress(stage, share): called as it
+    goes on, share in [0, 1]. watch(process ids by node): called ten times a second while data
+    flows. Raises LiveError where a node fails; no process is left behind.
     """
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda stage, share: None)
-    environment = _environment(domain_id)
+    environment, domain = _environment(), Domain()
     common = {'robot': robot}
     started: list[_Process] = []
     listeners: list[_Process] = []
@@ -153,7 +160,7 @@ def run_live(
         path = folder / f'{node}.json'
         path.unlink(missing_ok=True)
         started.append(
-            _Process(node, parameters | {'summary_file': str(path)}, folder, environment)
+            _Process(node, parameters | {'summary_file': str(path)}, folder, environment, domain)
         )
         return started[-1]
 
@@ -192,6 +199,7 @@ def run_live(
     finally:
         for process in started:
             process.kill()
+        domain.close()
     return _result(folder, record, tuple(process.log for process in started))
 
 
@@ -220,15 +228,13 @@ def _follow(
     tell('live', 1.0)
 
 
-def _environment(domain_id: int | None) -> dict[str, str]:
+def _environment() -> dict[str, str]:
     """
     Make the children's environment.
 
-    A graph of their own on this machine, and one thread for each numerical library.
+    A graph on this machine alone, and one thread for each numerical library.
     """
-    domain = domain_id if domain_id is not None else 1 + os.getpid() % 100
     own = {
-        'ROS_DOMAIN_ID': str(domain),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'OMP_NUM_THREADS': '1',
         'OPENBLAS_NUM_THREADS': '1',

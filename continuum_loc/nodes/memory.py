@@ -7,6 +7,7 @@ The newest trajectory, and the scene it saw.
 from __future__ import annotations
 
 from collections import deque
+from itertools import islice
 from pathlib import Path
 
 from continuum_loc.estimator.estimate import Estimate
@@ -41,7 +42,7 @@ class Trajectory:
 
     def recent(self, count: int) -> list[int]:
         """Return the newest `count` stamps."""
-        return [stamp for stamp, _ in list(self._poses)[-count:]]
+        return [stamp for stamp, _ in list(islice(reversed(self._poses), count))[::-1]]
 
     def track(self, robot: RobotDescription) -> Track:
         """All that is kept."""

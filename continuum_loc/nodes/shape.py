@@ -12,12 +12,15 @@ from typing import Any
 from continuum_loc.measurements import Measurement
 from continuum_loc.nodes.runtime import run
 from continuum_loc.nodes.settings import ShapeNodeSettings
-from continuum_loc.nodes.warm_up import rest_samples
 from continuum_loc.nodes.worker import ERROR, OK, WARN, WorkerNode
+from continuum_loc.robot import RobotDescription
 from continuum_loc.shape import load_shape_settings, ShapeEstimate, ShapeEstimator, ShapeSettings
+from continuum_loc.shape.simulate import Arm, Motion
 from msg_tools.records import PathRecord, PosesRecord
 import numpy as np
 from std_srvs.srv import Trigger
+
+AFTER_TARING = 1.0  # s of the rehearsal: estimates, and a check of the wiring
 
 
 class ShapeNode(WorkerNode):
@@ -36,9 +39,7 @@ class ShapeNode(WorkerNode):
         self.estimator = ShapeEstimator(self.robot, chosen)
         self.estimate: ShapeEstimate | None = None
         self.get_logger().info('compiling, or loading what an earlier run compiled')
-        for sample in rest_samples(self.robot, 1.0):
-            self.estimator.process(sample)
-        self.estimator = ShapeEstimator(self.robot, chosen)
+        rehearse(self.robot, chosen)
         for topic in ('shape/poses', 'shape/curve'):
             self.publisher(topic)
         self.create_service(Trigger, '~/reset', self._reset)
@@ -89,6 +90,19 @@ class ShapeNode(WorkerNode):
     def _start_over(self) -> None:
         self.intake.gate.reset()
         self.restart()
+
+
+def rehearse(robot: RobotDescription, settings: ShapeSettings) -> ShapeEstimate | None:
+    """
+    Compile what an estimator uses: one that is thrown away estimates a simulated arm at rest.
+
+    The arm is straight and not yet calibrated, which compiles the taring too.
+    """
+    own = settings.model_copy(update={'calibration': None, 'start': 'straight'})
+    estimator, arm = ShapeEstimator(robot, own), Arm(robot)
+    at_rest = Motion([arm.posture()], [own.taring_seconds + AFTER_TARING], [0.0])
+    made = [estimator.process(sample) for sample in arm.record(at_rest)]
+    return next((estimate for estimate in reversed(made) if estimate is not None), None)
 
 
 def frames_along(points: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ trajectory, forth and back, so that time never jumps: 16 ToF sensors at 15 Hz, 5
 strain, insertion. After a first tenth, in which buffers and caches fill, memory has to stay flat
 and latency must not grow; nothing may be lost, dropped or refused. The quick form lasts 40 s, once
 forth and back: it shows that the graph keeps up, and says nothing about memory or growth.
+`continuum-loc evaluate soak --minutes 7` shows the slope of memory, which the summary holds.
 """
 
 from __future__ import annotations
@@ -76,6 +77,9 @@ def soak(out: Path, duration: float, seed: int) -> list[Claim]:
             'counts': live.counts,
             'lost': live.lost,
             'load': {node: footprint.mean_load(node) for node in footprint.cpu},
+            'memory_mib_per_minute': {
+                node: _growth_per_minute(footprint, node) for node in footprint.memory
+            },
         },
     )
     return claims
@@ -176,6 +180,14 @@ def _course_claims(course: list[dict[str, Any]], footprint: Footprint) -> list[C
             at_most(f'growth of latency {name}', 100.0 * _growth(latency), '%', 100.0 * GROWTH)
         )
     return claims
+
+
+def _growth_per_minute(footprint: Footprint, node: str) -> float:
+    """Slope of a node's memory by least squares, after the first part of the time [MiB/min]."""
+    times = np.array(footprint.times)
+    settled = times >= times[-1] / PARTS
+    memory = np.array(footprint.memory[node])[settled] / MEBIBYTE
+    return float(60.0 * np.polyfit(times[settled], memory, 1)[0])
 
 
 def _growth(values: np.ndarray) -> float:
