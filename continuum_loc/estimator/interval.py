@@ -16,11 +16,12 @@ import numpy as np
 class Interval:
     """Measurements with stamps in (start, start + duration], by factor, and their `Blocks`."""
 
-    def __init__(self, start: float, dim: int):
+    def __init__(self, start: float, dim: int, nodes: int):
         self.start = start
         self.blocks = Blocks.zeros(dim)
         self.reports: dict[str, FactorReport] = {}
         self.changed = True
+        self.jerked = np.ones(nodes)  # what the process noise of each node is multiplied by
         self._times: dict[Factor, list[float]] = {}
         self._rows: dict[Factor, list[tuple]] = {}
         self._batches: dict[Factor, tuple] = {}
@@ -39,7 +40,7 @@ class Interval:
     def linearise(self, priors: Priors, a: Column, b: Column) -> None:
         """Build the normal equations at the columns a and b."""
         self.blocks.clear()
-        priors.add(self.blocks, a, b)
+        self.jerked = priors.add(self.blocks, a, b)
         for factor, rows in self._rows.items():
             if factor not in self._batches:
                 self._batches[factor] = factor.stack(np.array(self._times[factor]), rows)

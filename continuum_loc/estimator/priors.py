@@ -84,9 +84,14 @@ class Priors:
         H[biases, biases] += self.bias_information
         return Message(H, g)
 
-    def add(self, blocks: Blocks, a: Column, b: Column) -> None:
-        """Add the interval's time prior and the newer column's own factors; the cost too."""
+    def add(self, blocks: Blocks, a: Column, b: Column) -> np.ndarray:
+        """
+        Add the interval's time prior and the newer column's own factors; the cost too.
+
+        Returns what the process noise of each node (N,) was multiplied by.
+        """
         dt, D = b.time - a.time, self.grid.dim
+        jerked = np.empty(self.grid.nodes)
         cost = _add_time(
             blocks.H,
             blocks.g,
@@ -101,10 +106,12 @@ class Priors:
             self.strain_rate,
             self.cauchy,
             1.0 / self.jerked,
+            jerked,
         )
         _add_bias(blocks.H, blocks.g, a.bias, b.bias, self.bias_rate / dt, self.grid.bias_offset)
         own = self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
         blocks.cost += cost + 0.5 * own
+        return jerked
 
     def _add_column(self, H: np.ndarray, g: np.ndarray, column: Column, share: float) -> float:
         """
@@ -151,12 +158,14 @@ def _add_time(
     strain_information,
     cauchy,
     least,
+    jerked,
 ):
     """
     Add each node's step from knot to knot, under a Cauchy loss; returns the robust cost.
 
     The noise of a step is a heavy-tailed one that all components of a node share: its variance is
-    the settings' for a body that moves as usual, and grows where it is jerked, up to 1 / least.
+    the settings' for a body that moves as usual, and grows where it is jerked, up to 1 / least;
+    jerked (N,) gets by how much.
     """
     W, V, M = lie_kernels.workspace()
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
@@ -170,6 +179,7 @@ def _add_time(
             walk[i] = eps_b[n, i] - eps_a[n, i]
             squared += strain_information[i] / dt * walk[i] * walk[i]
         robust = max(1.0 / (1.0 + squared / c2), least)
+        jerked[n] = 1.0 / robust
         lossy = min(squared, c2 * (1.0 / least - 1.0))  # beyond it the loss is a square again
         cost += 0.5 * (c2 * np.log1p(lossy / c2) + least * (squared - lossy))
         for i in range(6):

@@ -21,10 +21,16 @@ SMOOTHED_BY = 2  # knots
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PastColumn:
-    """A column of the past, with each neighbouring pair of nodes' covariance (N - 1, 36, 36)."""
+    """
+    A column of the past.
+
+    covariance (N - 1, 36, 36) of each neighbouring pair of nodes; jerked (N,): what the process
+    noise was multiplied by in the interval that follows.
+    """
 
     column: Column
     covariance: np.ndarray
+    jerked: np.ndarray
 
 
 class History:
@@ -48,7 +54,11 @@ class History:
             return
         P = window.chain.covariance(k, np.eye(NODE_DIM * window.grid.nodes, window.grid.dim))
         pairs = [slice(NODE_DIM * n, NODE_DIM * (n + 2)) for n in range(window.grid.nodes - 1)]
-        self._columns.append(PastColumn(column, np.array([P[pair, pair] for pair in pairs])))
+        self._columns.append(
+            PastColumn(
+                column, np.array([P[pair, pair] for pair in pairs]), window.intervals[k].jerked
+            )
+        )
         while self._columns[0].column.time < column.time - self._duration:
             self._columns.popleft()
 
@@ -85,7 +95,7 @@ def _inside(window: Window, time: float, n: int):
     k = window.knot_before(time)
     A = _rows_of(window, n)
     P = window.chain.covariance(k, np.concatenate([A, 0.0 * A]), np.concatenate([0.0 * A, A]))
-    return _between(window, window.column(k), window.column(k + 1), P, time, n)
+    return _between(window, k, P, time, n)
 
 
 def _six(at: int) -> slice:
@@ -106,12 +116,13 @@ def _behind(window: Window, history: History, time: float, n: int):
     P = (1.0 - u) * older.covariance[n] + u * newer.covariance[n]
     body = body_between(older.column, newer.column, time)
     nodes = slice(n, n + 2)
-    P = P + _open_bridge(window, older.column, newer.column, time, n)
+    P = P + _open_bridge(window, older.column, newer.column, time, n, older.jerked)
     return body.T[nodes], body.strain[nodes], body.velocity[nodes], P
 
 
-def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n: int):
-    """Two nodes at `time` between two columns, and their joint covariance (36, 36)."""
+def _between(window: Window, k: int, P: np.ndarray, time: float, n: int):
+    """Two nodes at `time` in interval k, and their joint covariance (36, 36)."""
+    a, b = window.column(k), window.column(k + 1)
     d, tau = b.time - a.time, time - a.time
     u, m = tau / d, NODE_DIM
     J = np.zeros((2 * m, 4 * m))
@@ -128,26 +139,35 @@ def _between(window: Window, a: Column, b: Column, P: np.ndarray, time: float, n
         J[_six(at), _six(2 * m + at)] = u * np.eye(6)
     nodes = slice(n, n + 2)
     strain = (1.0 - u) * a.strain[nodes] + u * b.strain[nodes]
-    return T, strain, velocity, J @ P @ J.T + _open_bridge(window, a, b, time, n)
+    open_ = _open_bridge(window, a, b, time, n, window.intervals[k].jerked)
+    return T, strain, velocity, J @ P @ J.T + open_
 
 
-def _open_bridge(window: Window, a: Column, b: Column, time: float, n: int) -> np.ndarray:
+def _open_bridge(
+    window: Window, a: Column, b: Column, time: float, n: int, jerked: np.ndarray
+) -> np.ndarray:
     """Covariance (36, 36) that two columns leave open of the two nodes between them."""
     d, tau = b.time - a.time, time - a.time
     motion = np.empty((2, 2))
     gp.bridge(tau, d, motion)
-    return _process_noise(window, n, motion, tau * (d - tau) / d)
+    return _process_noise(window, n, jerked, motion, tau * (d - tau) / d)
 
 
-def _process_noise(window: Window, n: int, motion: np.ndarray, strain: float) -> np.ndarray:
-    """Covariance (36, 36) of nodes n and n + 1: `motion` (2, 2) and `strain` times the noise."""
-    Q = np.zeros((2 * NODE_DIM, 2 * NODE_DIM))
+def _process_noise(
+    window: Window, n: int, jerked: np.ndarray, motion: np.ndarray, strain: float
+) -> np.ndarray:
+    """
+    Covariance (36, 36) of nodes n and n + 1: `motion` (2, 2) and `strain` times the noise.
+
+    jerked (N,): what the noise of each node is multiplied by.
+    """
+    Q, psd = np.zeros((2 * NODE_DIM, 2 * NODE_DIM)), window.priors.velocity_psd
     for i in range(2):
         start = NODE_DIM * i
         at = start + np.concatenate([np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)])
-        Q[np.ix_(at, at)] = np.kron(motion, np.diag(window.priors.velocity_psd[n + i]))
+        Q[np.ix_(at, at)] = np.kron(motion, np.diag(jerked[n + i] * psd[n + i]))
         at = start + np.arange(STRAIN, STRAIN + 6)
-        Q[at, at] = strain / window.priors.strain_rate
+        Q[at, at] = jerked[n + i] * strain / window.priors.strain_rate
     return Q
 
 
@@ -163,8 +183,8 @@ def _ahead(window: Window, time: float, n: int):
         J[_six(at), _six(at)] = lie.adjoint(lie.exp(-twist))
         J[_six(at), _six(at + VELOCITY)] = dt * lie.right_jacobian(twist)
     growth = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-    covariance = J @ P @ J.T + _process_noise(window, n, growth, dt)
     nodes = slice(n, n + 2)
+    covariance = J @ P @ J.T + _process_noise(window, n, window.intervals[k].jerked, growth, dt)
     return later.T[nodes], later.strain[nodes], later.velocity[nodes], covariance
 
 

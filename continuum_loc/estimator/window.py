@@ -88,7 +88,7 @@ class Window:
 
     def _append(self) -> None:
         newest = self.column(-1)
-        self.intervals.append(Interval(newest.time, self.grid.dim))
+        self.intervals.append(Interval(newest.time, self.grid.dim, self.grid.nodes))
         self.columns.append(newest.predict(self.settings.knot_period))
         self.offsets.append(np.zeros(self.grid.dim))
         if self.columns[-1].time - self.columns[1].time > self.settings.window - TIME_EPSILON:
@@ -351,4 +351,5 @@ class Window:
         a, b = self.column(k), self.column(k + 1)
         P = self.chain.covariance(k, *motion_jacobians(a, b, time, nodes, self.grid.dim))
         own = P.reshape(m, 12, m, 12)[np.arange(m), :, np.arange(m)]
-        return own + motion_bridge(a, b, time, self.priors.velocity_psd[nodes])
+        velocity_psd = self.intervals[k].jerked[:, None] * self.priors.velocity_psd
+        return own + motion_bridge(a, b, time, velocity_psd[nodes])
