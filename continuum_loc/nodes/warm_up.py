@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.reconstruct import RingTrajectory
 from continuum_loc.measurements import (
     EncoderSample,
@@ -49,6 +50,24 @@ def rest_samples(
             yield StrainSample(stamp, s, np.zeros_like(s), np.zeros_like(s))
         if _due(step, tick, robot.tof_model.rate):
             yield from _frames(robot, stamp, rng)
+
+
+def hurried(settings: EstimatorSettings) -> EstimatorSettings:
+    """Return settings that use the same kernels, with as little work as there can be."""
+    recovery = {
+        'suspect_share': 1.0,  # search at once
+        'curvature_step': settings.recovery.max_curvature,
+        'beam': 1,
+        'refined': 1,
+    }
+    return settings.model_copy(
+        update={
+            'recovery': settings.recovery.model_copy(update=recovery),
+            'solver': settings.solver.model_copy(
+                update={'max_iterations': 2, 'acquisition_iterations': 2}
+            ),
+        }
+    )
 
 
 def warm_up(filter_: Any, scene: SeenScene, robot: RobotDescription, window: float) -> None:
