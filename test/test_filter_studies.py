@@ -6,6 +6,7 @@ Times off, recovery, culprits, honesty.
 
 from dataclasses import replace
 import json
+from pathlib import Path
 
 from continuum_loc.estimator import EstimatorSettings, load_estimator_settings, SlidingWindowFilter
 from continuum_loc.evaluation.metrics import DOF, Errors, errors
@@ -199,7 +200,9 @@ def recorded(monkeypatch):
 
     for name, stand_in in (
         ('record_bags', lambda *_: {}),
-        ('scene_map', lambda scene: None),
+        ('scene_map_file', Path),
+        ('load_map', lambda file: None),
+        ('made_by', lambda bag: ''),
         ('make_filter', filter_),
         ('samples_of', lambda bag: samples(load_robot('engine'), 2.0)),
     ):

@@ -358,7 +358,8 @@ def test_cycles_split_by_late_clocks_are_whole_again_after(prior_map):
     """The next outputs wait again for every sensor of their instant."""
     robot = rod()
     samples = [s for s in stream(Rod(robot), 2.0) if not isinstance(s, TruthSample)]
-    late = {sensor.name for sensor in robot.tof[len(robot.tof) // 2 :]}
+    half = len(robot.tof) // 2
+    late = {sensor.name for sensor in robot.tof[half:]}
     filter_, heard, whole = SlidingWindowFilter(robot, prior_map, settings()), {}, []
     for sample in samples:
         time = (sample.stamp - EPOCH) * 1e-9
