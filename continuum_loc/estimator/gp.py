@@ -70,14 +70,9 @@ def hermite(T_a, v_a, T_b, v_b, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
 def evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
     """`hermite` between two states that `relate` left in the workspace: any number of times."""
     rate_at(v_a, d, tau, v, W, V)
-    u = tau / d
-    by_gamma, by_rate = J_work[0], J_work[1]
-    _chain_rate(
-        u * u * (3.0 - 2.0 * u), u * (1.0 - u) ** 2 * d, u * u * (u - 1.0) * d, W, by_gamma
-    )
-    _chain_rate(
-        6.0 * u * (1.0 - u) / d, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0), W, by_rate
-    )
+    by_gamma, by_rate, h = J_work[0], J_work[1], V[13]
+    _chain_rate(h[0], h[1], h[2], W, by_gamma)
+    _chain_rate(h[3], h[4], h[5], W, by_rate)
     _advance(T_a, T, V, M)
     lk.polynomial(V[11], W[6], W[8], W[9:11])
     lk.relative(T, T_a, M[2])
@@ -95,13 +90,21 @@ def evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
 
 @njit(cache=True)
 def _local(v_a, d, tau, V):
-    """Gamma into V[9] and its derivative into V[10], from what `relate` left in V."""
-    u = tau / d
-    h1, h2, h3 = u * u * (3.0 - 2.0 * u), u * (1.0 - u) * (1.0 - u) * d, -u * u * (1.0 - u) * d
-    g1, g2, g3 = 6.0 * u * (1.0 - u) / d, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)
+    """
+    Gamma into V[9] and its derivative into V[10], from what `relate` left in V.
+
+    The weights of xi, v_a and w go to V[13]: three for gamma, three for its derivative.
+    """
+    u, h = tau / d, V[13]
+    h[0], h[1], h[2] = (
+        u * u * (3.0 - 2.0 * u),
+        u * (1.0 - u) * (1.0 - u) * d,
+        u * u * (u - 1.0) * d,
+    )
+    h[3], h[4], h[5] = 6.0 * u * (1.0 - u) / d, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)
     for i in range(6):
-        V[9, i] = h1 * V[0, i] + h2 * v_a[i] + h3 * V[3, i]
-        V[10, i] = g1 * V[0, i] + g2 * v_a[i] + g3 * V[3, i]
+        V[9, i] = h[0] * V[0, i] + h[1] * v_a[i] + h[2] * V[3, i]
+        V[10, i] = h[3] * V[0, i] + h[4] * v_a[i] + h[5] * V[3, i]
 
 
 @njit(cache=True)
@@ -123,8 +126,8 @@ def rate_at(v_a, d, tau, v, W, V):
     """
     Rate v (6,) alone, between two states that `relate` left in the workspace.
 
-    Leaves gamma in V[9], ad(gamma) in W[6], the derivative of J_r(gamma) gamma' by gamma in W[7]
-    and the coefficients of J_r in V[11].
+    Leaves gamma in V[9], ad(gamma) in W[6], the derivative of J_r(gamma) gamma' by gamma in W[7],
+    the coefficients of J_r in V[11] and the weights in V[13].
     """
     _local(v_a, d, tau, V)
     gamma, rate = V[9], V[10]

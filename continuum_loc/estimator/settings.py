@@ -95,7 +95,10 @@ class TofSettings(Settings):
         0.15, ge=0.0, lt=1.0, description='least cosine of incidence for a match'
     )
     planarity_power: float = Field(
-        1.0, ge=0.0, description='weight = planarity ** power; 0 switches it off'
+        1.0,
+        ge=0.0,
+        description="weight = (planarity over the map's median, at most 1) ** power; 0 switches "
+        'it off',
     )
 
 

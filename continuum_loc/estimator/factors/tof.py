@@ -64,7 +64,11 @@ class TofFactor(Factor):
                 np.ascontiguousarray(prior_map.points),
                 np.ascontiguousarray(prior_map.normals),
             )
-            self._planarity = prior_map.planarity**settings.tof.planarity_power
+            # A flat patch of scattered points has 0.8 to 0.9, which counts as whole: as a share of
+            # the information it would make the covariance too large.
+            flat = max(float(np.median(prior_map.planarity)), 1e-9)
+            alpha = np.minimum(prior_map.planarity / flat, 1.0)
+            self._planarity = alpha**settings.tof.planarity_power
             self._map_variance = prior_map.sigma**2
         model = robot.tof_model
         self._noise_distance = np.array(model.noise_distance)
