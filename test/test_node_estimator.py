@@ -9,11 +9,6 @@ from pathlib import Path
 import signal
 import time
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import nanoseconds, TofFrame
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -21,6 +16,7 @@ from msg_tools.convert import tracker_message
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
 from node_graph import BoxRobot, Client, COMPILING, fresh_domain, Process, wait_until
+import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter

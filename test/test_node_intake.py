@@ -9,11 +9,6 @@ from dataclasses import fields, replace
 import threading
 import time
 
-import numpy as np
-import pytest
-
-pytest.importorskip('numba')
-
 from continuum_loc.estimator import settings_of, SlidingWindowFilter
 from continuum_loc.measurements import (
     EncoderSample,
@@ -30,6 +25,7 @@ from continuum_loc.nodes.warm_up import rest_samples
 from continuum_loc.robot import load_robot
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.topics import topic_spec
+import numpy as np
 import pytest
 
 SECOND = 10**9

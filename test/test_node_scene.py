@@ -2,16 +2,13 @@
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.mapping.anomalies import AnomalySettings
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.nodes.memory import SeenScene
 from node_graph import BOX, BoxRobot
+import numpy as np
+import pytest
 
 SECOND = 10**9
 TICK = SECOND // 15

@@ -4,16 +4,13 @@ from dataclasses import replace
 import json
 import signal
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds, TrackedPose
 from msg_tools.bag import BagWriter
 from msg_tools.convert import time_message
 from msg_tools.factory import ros_messages
 from node_graph import BoxRobot, Client, COMPILING, fresh_domain, Process, wait_until
+import numpy as np
+import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 

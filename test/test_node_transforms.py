@@ -4,15 +4,12 @@ from importlib.machinery import ModuleSpec
 import sys
 from types import ModuleType, SimpleNamespace
 
-import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-
 from continuum_loc import lie
 from continuum_loc.nodes import transforms
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
+import numpy as np
+import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 

@@ -31,7 +31,7 @@ class Domain:
 
     @property
     def lock(self) -> int:
-        """The open file that holds the domain."""
+        """Return the open file that holds the domain."""
         return self._file.fileno()
 
     def close(self) -> None:
