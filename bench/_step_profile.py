@@ -29,7 +29,7 @@ PARTS = {
     'ToF: matching and information': [('tof.py', '_add')],
     'strain': [('factors/strain.py', '_add')],
     'gyro': [('factors/gyro.py', '_add')],
-    'priors': [('priors.py', '_add_time'), ('priors.py', '_add_space')],
+    'priors': [('priors.py', f'_add_{of}') for of in ('time', 'space', 'base', 'bias')],
     'elimination and solve': [
         ('chain.py', '_eliminate'),
         ('chain.py', '_cholesky'),

@@ -21,6 +21,7 @@ DURATION, QUICK_DURATION = 20.0, 8.0  # s
 
 def run(quick: bool = False) -> list[dict]:
     """Rows of name and ours_s; `rate_hz` where a row is about messages."""
+    from continuum_loc.evaluation.bench import alone
     from continuum_loc.evaluation.footprint import Footprint
     from continuum_loc.evaluation.trials import scene_map_file
     from continuum_loc.nodes.live import run_live
@@ -36,28 +37,17 @@ def run(quick: bool = False) -> list[dict]:
         )
     seconds = footprint.times[-1] - footprint.times[0]
     rows = [
-        _row(f'live, latency from ToF stamp to pose, {name}', live.latency_ms[name] * 1e-3)
+        alone(f'live, latency from ToF stamp to pose, {name}', live.latency_ms[name] * 1e-3)
         for name in ('p50', 'p95', 'p99')
     ]
     rows += [
-        _row(f'live, processor time of the {node} per second', footprint.mean_load(node))
+        alone(f'live, processor time of the {node} per second', footprint.mean_load(node))
         for node in ('estimator', 'simulator')
     ]
-    rows.append(_row('live, filter step and publication, mean', live.step_ms['mean'] * 1e-3))
+    rows.append(alone('live, filter step and publication, mean', live.step_ms['mean'] * 1e-3))
     received = sum(live.counts['estimator']['received'].values())
     for name, count in (('messages received', received), ('poses', len(live.latencies_s))):
         rate = count / (QUICK_DURATION if quick else DURATION)
-        rows.append(_row(f'live, between {name}', 1.0 / rate) | {'rate_hz': rate})
+        rows.append(alone(f'live, between {name}', 1.0 / rate, rate_hz=rate))
     lost = sum(live.lost.values()) + sum(live.counts['estimator']['dropped'].values())
     return [row | {'lost': lost, 'watched_s': seconds} for row in rows]
-
-
-def _row(name: str, seconds: float) -> dict:
-    return {
-        'name': name,
-        'ours_s': float(seconds),
-        'peer': None,
-        'peer_s': None,
-        'ratio': None,
-        'spread': None,
-    }

@@ -8,9 +8,8 @@ rays beside MuJoCo's.
 
 from __future__ import annotations
 
-import time
-
-from continuum_loc.evaluation.bench import one_core
+from continuum_loc.evaluation.bench import alone, one_core
+from continuum_loc.evaluation.studies.simulator import seconds_of_processor
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.world import World
@@ -35,28 +34,6 @@ def run(quick: bool = False) -> list[dict]:
     worlds['live engine in empty space, t3'] = World(robot, None, 't3')
     with one_core():
         return [
-            _row(name, _seconds(world, 3.0 if quick else 20.0)) for name, world in worlds.items()
+            alone(name, seconds_of_processor(world, 3.0 if quick else 20.0))
+            for name, world in worlds.items()
         ]
-
-
-def _seconds(world: World, duration: float) -> float:
-    """Processor time of a second of data, after what is compiled and settled once."""
-    for _ in world.run(0.2):
-        pass
-    samples = world.run(duration)
-    next(samples)
-    start = time.process_time()
-    for _ in samples:
-        pass
-    return (time.process_time() - start) / duration
-
-
-def _row(name: str, seconds: float) -> dict:
-    return {
-        'name': name,
-        'ours_s': seconds,
-        'peer': None,
-        'peer_s': None,
-        'ratio': None,
-        'spread': None,
-    }

@@ -9,7 +9,7 @@ import sys
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
 from continuum_loc.nodes.memory import SeenScene
-from continuum_loc.nodes.warm_up import hurried, warm_up
+from continuum_loc.nodes.warm_up import warm_up
 from continuum_loc.settings import parse_settings
 from numba.core.dispatcher import Dispatcher
 from worlds import Rod, rod, room_map, stream
@@ -28,9 +28,7 @@ def compiled():
 
 robot, prior = rod(), room_map()
 settings = parse_settings(EstimatorSettings, {'knot_period': 0.1, 'window': 0.6, 'lag': 0.2})
-warm_up(
-    SlidingWindowFilter(robot, prior, hurried(settings)), SeenScene(robot, prior, 5.0), robot, 0.6
-)
+warm_up(robot, prior, settings, SeenScene(robot, prior, 5.0))
 before = compiled()
 estimator = SlidingWindowFilter(robot, prior, settings)
 searched = []

@@ -16,7 +16,7 @@ from continuum_loc.nodes.memory import SeenScene, Trajectory
 from continuum_loc.nodes.runtime import run
 from continuum_loc.nodes.settings import EstimatorNodeSettings
 from continuum_loc.nodes.transforms import broadcaster
-from continuum_loc.nodes.warm_up import hurried, warm_up
+from continuum_loc.nodes.warm_up import warm_up
 from continuum_loc.nodes.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -254,10 +254,7 @@ class EstimatorNode(WorkerNode):
     def _warm_up(self) -> None:
         if self.settings.warm_up:
             self.get_logger().info('compiling, or loading what an earlier run compiled')
-            rehearsing = SlidingWindowFilter(
-                self.robot, self.prior_map, hurried(self.filter_settings)
-            )
-            warm_up(rehearsing, self.scene, self.robot, self.filter_settings.window)
+            warm_up(self.robot, self.prior_map, self.filter_settings, self.scene)
 
 
 def with_base(

@@ -7,9 +7,10 @@ A throw-away filter runs on made-up samples of the robot at rest.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
+from continuum_loc.estimator.filter import SlidingWindowFilter
 from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.reconstruct import RingTrajectory
 from continuum_loc.measurements import (
     EncoderSample,
@@ -70,20 +71,25 @@ def hurried(settings: EstimatorSettings) -> EstimatorSettings:
     )
 
 
-def warm_up(filter_: Any, scene: SeenScene, robot: RobotDescription, window: float) -> None:
+def warm_up(
+    robot: RobotDescription,
+    prior_map: PriorMap | None,
+    settings: EstimatorSettings,
+    scene: SeenScene,
+) -> None:
     """
-    Compile every kernel that `filter_` and `scene` use.
+    Compile every kernel that a filter of these settings and `scene` use.
 
-    Runs the filter past its first marginalisation, places what would be seen then, and resets the
-    filter. The tube is not what the map shows, so that the search for a lost body compiles too.
+    Runs such a filter past its first marginalisation, and places what would be seen then. The tube
+    is not what the map shows, so that the search for a lost body compiles too.
     """
-    made = [filter_.process(sample) for sample in rest_samples(robot, 1.3 * window + 0.3)]
+    filter_ = SlidingWindowFilter(robot, prior_map, hurried(settings))
+    duration = 1.3 * settings.window + 0.3
+    made = [filter_.process(sample) for sample in rest_samples(robot, duration)]
     estimate = next((one for one in reversed(made) if one is not None), None)
     if estimate is not None and robot.tof:
         frames = list(_frames(robot, estimate.stamp, np.random.default_rng(0)))
         scene.placed(frames, RingTrajectory.of_estimates([estimate]))
-    filter_.flush()
-    filter_.reset()
 
 
 def _due(step: int, tick: float, rate: float) -> bool:

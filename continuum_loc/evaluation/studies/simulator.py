@@ -528,11 +528,16 @@ def real_time_factor(duration: float, seed: int = 0, fidelity: str = 'vl53l5cx')
     from continuum_loc.simulator.scenes import load_scene
 
     world = World(load_robot('engine'), load_scene('S0'), 't1', tof_fidelity=fidelity, seed=seed)
-    for _ in world.run(0.2):  # compile and settle
+    return 1.0 / seconds_of_processor(world, duration)
+
+
+def seconds_of_processor(world: World, duration: float) -> float:
+    """Processor time of a simulated second, after what is compiled and settled once."""
+    for _ in world.run(0.2):
         pass
     samples = world.run(duration)
     next(samples)
     start = time.process_time()
     for _ in samples:
         pass
-    return duration / (time.process_time() - start)
+    return (time.process_time() - start) / duration
