@@ -132,7 +132,7 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
         scale = np.linalg.norm(blocks.g) * np.linalg.norm(x) / np.sqrt(len(x))
         if kind == 'tof':
             # Planarity weighs the information, not the reported squares; here it is one.
-            assert np.all(factor._planarity == 1.0)
+            assert np.all(factor.surface[:, 6] == 1.0)
         assert slope == pytest.approx(blocks.g @ x, abs=1e-5 * scale + 1e-6 * abs(slope))
 
 

@@ -12,7 +12,7 @@ the oldest to the newest leaves on each a *message* (Lambda, eta), all that the 
 
 Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the
 message it left. Messages before the first interval that changed are kept from the last solve, and
-covariances come from the same triangular factors; no matrix is ever inverted.
+covariances come from the same triangular factors (`Factor`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from numba import njit
 import numpy as np
 from scipy.linalg import blas, lapack
+
+BLOCK = 54  # rows of a factor that are solved at once: three nodes
 
 
 class SingularError(ArithmeticError):
@@ -65,11 +67,50 @@ class Message:
     gradient: np.ndarray
 
 
+class Factor:
+    """
+    Lower Cholesky factor L (D, D) of a positive definite matrix, and solving with it.
+
+    Many right-hand sides are solved by blocks of L's rows: a product with what is solved, then one
+    with the inverse of the small diagonal block. Products run at two to three times the speed of
+    BLAS's triangular solver at these sizes, and blocks this small lose nothing in accuracy.
+    """
+
+    __slots__ = ('L', '_inverses')
+
+    def __init__(self, L: np.ndarray):
+        self.L = L
+        self._inverses: list[np.ndarray] | None = None
+
+    def whiten(self, B: np.ndarray) -> np.ndarray:
+        """L^-1 B (D, m)."""
+        starts = range(0, len(self.L), BLOCK)
+        if self._inverses is None:
+            self._inverses = [
+                lapack.dtrtri(self.L[at : at + BLOCK, at : at + BLOCK], lower=1)[0]
+                for at in starts
+            ]
+        X = np.empty(B.shape)
+        for at, inverse in zip(starts, self._inverses, strict=True):
+            rows = slice(at, at + BLOCK)
+            rest = B[rows] - self.L[rows, :at] @ X[:at] if at else B[rows]
+            np.matmul(inverse, rest, out=X[rows])
+        return X
+
+    def lower(self, b: np.ndarray) -> np.ndarray:
+        """L^-1 b (D,)."""
+        return blas.dtrsv(self.L, b, lower=1)
+
+    def upper(self, b: np.ndarray) -> np.ndarray:
+        """L^-T b (D,)."""
+        return blas.dtrsv(self.L, b, lower=1, trans=1)
+
+
 @dataclass(slots=True, eq=False)
 class _Elimination:
-    """One eliminated column: L (lower Cholesky of S), Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
+    """One eliminated column: the factor of S, Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
 
-    L: np.ndarray
+    factor: Factor
     Y: np.ndarray
     y: np.ndarray
 
@@ -81,17 +122,17 @@ class Chain:
         self.dim = dim
         self.messages = [start]
         self._eliminated: list[_Elimination] = []
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._last: tuple[Factor, np.ndarray] | None = None
 
     def solve(
         self, intervals: list[Blocks], first_changed: int, damping: float = 0.0
     ) -> list[np.ndarray]:
         """Offsets (D,) of all columns. Raises SingularError."""
         self._forward(intervals, first_changed, damping)
-        L, y = self._last
-        offsets = [-_solve_upper(L, y)]
+        factor, y = self._last
+        offsets = [-factor.upper(y)]
         for step in reversed(self._eliminated):
-            offsets.append(-_solve_upper(step.L, step.y + step.Y @ offsets[-1]))
+            offsets.append(-step.factor.upper(step.y + step.Y @ offsets[-1]))
         return offsets[::-1]
 
     def covariance(self, column: int, A: np.ndarray, B: np.ndarray | None = None) -> np.ndarray:
@@ -103,16 +144,14 @@ class Chain:
         With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero
         above `column`: the cost grows with the columns after it, not with the window.
         """
-        X = blas.dtrsm(1.0, self._factor(column), A.T, lower=1)
-        covariance = blas.dsyrk(1.0, X, trans=1, lower=1)
+        X = self._factor(column).whiten(A.T)
+        covariance = blas.dsyrk(1.0, X.T, lower=1)
         for k in range(column + 1, len(self._eliminated) + 1):
             right = -(self._eliminated[k - 1].Y.T @ X)
             if B is not None and k == column + 1:
                 right += B.T
-            X = blas.dtrsm(1.0, self._factor(k), right, lower=1)
-            covariance = blas.dsyrk(
-                1.0, X, beta=1.0, c=covariance, trans=1, lower=1, overwrite_c=1
-            )
+            X = self._factor(k).whiten(right)
+            covariance = blas.dsyrk(1.0, X.T, beta=1.0, c=covariance, lower=1, overwrite_c=1)
         return _symmetrised(covariance)
 
     def quadratic(self, C: np.ndarray) -> np.ndarray:
@@ -123,14 +162,16 @@ class Chain:
         """
         total, right = np.zeros((C.shape[2], C.shape[2])), C[0]
         for k in range(len(C)):
-            y = blas.dtrsm(1.0, self._factor(k), right, lower=1)
+            y = self._factor(k).whiten(right)
             total += y.T @ y
             if k + 1 < len(C):
                 right = C[k + 1] - self._eliminated[k].Y.T @ y
         return total
 
-    def _factor(self, column: int) -> np.ndarray:
-        return self._eliminated[column].L if column < len(self._eliminated) else self._last[0]
+    def _factor(self, column: int) -> Factor:
+        if column < len(self._eliminated):
+            return self._eliminated[column].factor
+        return self._last[0]
 
     def forget_oldest(self, oldest: Blocks, changed: bool) -> None:
         """
@@ -153,26 +194,26 @@ class Chain:
         for k in range(first, len(intervals)):
             self._eliminate(intervals[k], k, damping)
         newest = self.messages[-1]
-        L = _cholesky(newest.information, damping, len(intervals))
-        self._last = (L, _solve_lower(L, newest.gradient))
+        factor = _factored(newest.information, damping, len(intervals))
+        self._last = (factor, factor.lower(newest.gradient))
 
     def _eliminate(self, interval: Blocks, k: int, damping: float) -> None:
         D, H, g, message = self.dim, interval.H, interval.g, self.messages[k]
-        L = _cholesky(message.information + H[:D, :D], damping, k)
-        Y = blas.dtrsm(1.0, L, H[D:, :D].T, lower=1)
-        y = _solve_lower(L, message.gradient + g[:D])
-        information = blas.dsyrk(-1.0, Y, beta=1.0, c=H[D:, D:].T, trans=1, lower=1)
-        self._eliminated.append(_Elimination(L, Y, y))
+        factor = _factored(message.information + H[:D, :D], damping, k)
+        Y = factor.whiten(H[D:, :D].T)
+        y = factor.lower(message.gradient + g[:D])
+        information = blas.dsyrk(-1.0, Y.T, beta=1.0, c=H[D:, D:].T, lower=1)
+        self._eliminated.append(_Elimination(factor, Y, y))
         self.messages.append(Message(_symmetrised(information), g[D:] - Y.T @ y))
 
 
-def _cholesky(S: np.ndarray, damping: float, column: int) -> np.ndarray:
+def _factored(S: np.ndarray, damping: float, column: int) -> Factor:
     if damping > 0.0:
         S = S + damping * np.diag(np.diag(S))
     L, info = lapack.dpotrf(S, lower=1, clean=1)
     if info != 0 or not np.isfinite(L[-1, -1]):
         raise SingularError(column)
-    return L
+    return Factor(L)
 
 
 def _symmetrised(lower: np.ndarray) -> np.ndarray:
@@ -187,11 +228,3 @@ def _mirror(matrix):
     for j in range(matrix.shape[1]):
         for i in range(j):
             matrix[i, j] = matrix[j, i]
-
-
-def _solve_lower(L: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return blas.dtrsv(L, b, lower=1)
-
-
-def _solve_upper(L: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return blas.dtrsv(L, b, lower=1, trans=1)

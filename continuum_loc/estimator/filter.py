@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from operator import itemgetter
 import time as clock
 
 from continuum_loc.estimator.chain import SingularError
@@ -69,6 +70,8 @@ class SlidingWindowFilter:
             'dropped': Counter(),
             'restarts': Counter(),
         }
+        s_imu = {imu.name: robot.sensor_arclength(imu.name) for imu in robot.imu}
+        self._s_imu = dict(sorted(s_imu.items(), key=itemgetter(1)))
         self._backbone_s = np.linspace(0.0, robot.length, self.settings.backbone_points)
         self._threads = ThreadpoolController()
         self.reset()
@@ -256,7 +259,7 @@ class SlidingWindowFilter:
             self._guess_shape()
         try:
             iterations, converged = (
-                self.window.track() if self.recovery.acquired else self.recovery.acquire()
+                self.window.track(time) if self.recovery.acquired else self.recovery.acquire()
             )
         except SingularError:
             self.counts['restarts']['singular'] += 1
@@ -299,10 +302,9 @@ class SlidingWindowFilter:
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:
         """Covariance (m, 6, 6) at s (m,) of what gyros feel and the motion of the knots misses."""
         variances = self.window.rattle(time)
-        imus = sorted(variances, key=self.robot.sensor_arclength)
-        turns = np.sqrt([variances[name] for name in imus]).reshape(-1, 3)
-        s_imu = np.array([self.robot.sensor_arclength(name) for name in imus])
-        return rattle_covariance(s_imu, turns, s)
+        s_imu = {name: self._s_imu[name] for name in self._s_imu if name in variances}
+        turns = np.sqrt([variances[name] for name in s_imu]).reshape(-1, 3)
+        return rattle_covariance(np.array(list(s_imu.values())), turns, s)
 
     def _compose(
         self,

@@ -68,24 +68,38 @@ def hermite(T_a, v_a, T_b, v_b, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
 
 @njit(cache=True)
 def evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
-    """`hermite` between two states that `relate` left in the workspace: any number of times."""
+    """
+    `hermite` between two states that `relate` left in the workspace: any number of times.
+
+    A Jacobian that has no rows is left out.
+    """
     rate_at(v_a, d, tau, v, W, V)
     by_gamma, by_rate, h = J_work[0], J_work[1], V[13]
     _chain_rate(h[0], h[1], h[2], W, by_gamma)
-    _chain_rate(h[3], h[4], h[5], W, by_rate)
     _advance(T_a, T, V, M)
     lk.polynomial(V[11], W[6], W[8], W[9:11])
-    lk.relative(T, T_a, M[2])
-    lk.adjoint(M[2], W[9])
-    for i in range(6):
-        for j in range(24):
-            J_pose[i, j] = W[9, i, j] if j < 6 else 0.0
-            J_rate[i, j] = 0.0
-        for k in range(6):  # the innermost loop is over neighbours in memory
-            by_pose, by_turn = W[8, i, k], W[7, i, k]
+    if J_pose.shape[0] > 0:
+        lk.relative(T, T_a, M[2])
+        lk.adjoint(M[2], W[9])
+        for i in range(6):
             for j in range(24):
-                J_pose[i, j] += by_pose * by_gamma[k, j]
-                J_rate[i, j] += by_turn * by_gamma[k, j] + by_pose * by_rate[k, j]
+                J_pose[i, j] = W[9, i, j] if j < 6 else 0.0
+        _add_product(W[8], by_gamma, J_pose)
+    if J_rate.shape[0] > 0:
+        _chain_rate(h[3], h[4], h[5], W, by_rate)
+        J_rate[:, :] = 0.0
+        _add_product(W[7], by_gamma, J_rate)
+        _add_product(W[8], by_rate, J_rate)
+
+
+@njit(cache=True)
+def _add_product(A, B, out):
+    """Add A (6, 6) B (6, 24) to out."""
+    for i in range(6):
+        for k in range(6):  # the innermost loop is over neighbours in memory
+            scale = A[i, k]
+            for j in range(24):
+                out[i, j] += scale * B[k, j]
 
 
 @njit(cache=True)
@@ -276,6 +290,8 @@ def gather(H_sum, g_sum, H_local, g_local, J, work):
     for j in range(n):
         for i in range(m):
             slope = J[i, j]
+            if slope == 0.0:
+                continue
             g_sum[j] += slope * g_local[i]
             for k in range(n):
                 H_sum[j, k] += slope * work[i, k]

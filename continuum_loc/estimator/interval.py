@@ -25,6 +25,7 @@ class Interval:
         self._times: dict[Factor, list[float]] = {}
         self._rows: dict[Factor, list[tuple]] = {}
         self._batches: dict[Factor, tuple] = {}
+        self._scores: dict[Factor, ClockScores | None] = {}  # at the current linearisation
 
     def add(self, factor: Factor, time: float, row: tuple) -> None:
         """Take a factor's row at `time` [s since the filter's epoch]."""
@@ -40,6 +41,7 @@ class Interval:
     def linearise(self, priors: Priors, a: Column, b: Column) -> None:
         """Build the normal equations at the columns a and b."""
         self.blocks.clear()
+        self._scores.clear()
         self.jerked = priors.add(self.blocks, a, b)
         for factor, rows in self._rows.items():
             if factor not in self._batches:
@@ -51,8 +53,9 @@ class Interval:
 
     def clock_scores(self, factor: Factor, a: Column, b: Column) -> ClockScores | None:
         """How the factor's measurements here would change with their sensors' clocks."""
-        batch = self._batches.get(factor)
-        return None if batch is None else factor.clock_scores(batch, a, b)
+        if factor in self._batches and factor not in self._scores:
+            self._scores[factor] = factor.clock_scores(self._batches[factor], a, b)
+        return self._scores.get(factor)
 
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
         """Cost that the quadratic model gives at offsets from the linearisation point."""

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE, VELOCITY
 from numba import njit
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
@@ -62,6 +61,22 @@ def body_between(a: Column, b: Column, time: float) -> Body:
     )
     u = (time - a.time) / d
     return Body(T, (1.0 - u) * a.strain + u * b.strain, velocity)
+
+
+def blended_step(step_a: np.ndarray, step_b: np.ndarray, d: float, tau: float) -> np.ndarray:
+    """
+    Pose step (N, 6) at tau between two states whose nodes step by (N, 18), to first order.
+
+    The cubic Hermite with the relative pose taken for small.
+    """
+    u = tau / d
+    h1, h2, h3 = u * u * (3.0 - 2.0 * u), u * (1.0 - u) * (1.0 - u) * d, u * u * (u - 1.0) * d
+    return (
+        (1.0 - h1) * step_a[:, POSE : POSE + 6]
+        + h2 * step_a[:, VELOCITY : VELOCITY + 6]
+        + h1 * step_b[:, POSE : POSE + 6]
+        + h3 * step_b[:, VELOCITY : VELOCITY + 6]
+    )
 
 
 def interpolated_poses(
@@ -142,7 +157,8 @@ def rattle_covariance(s_imu: np.ndarray, turns: np.ndarray, s: np.ndarray) -> np
     """
     at = np.append(0.0, s_imu)
     turn = np.vstack([np.zeros(3), turns])
-    shift = cumulative_trapezoid(turn, at, axis=0, initial=0.0)
+    shift = np.zeros(turn.shape)
+    np.cumsum(np.diff(at)[:, None] * 0.5 * (turn[1:] + turn[:-1]), axis=0, out=shift[1:])
     deviation = np.zeros((len(s), 6))
     for i in range(3):
         deviation[:, 3 + i] = np.interp(s, at, turn[:, i])

@@ -369,18 +369,15 @@ def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
     """
     from continuum_loc.mapping.voxel_index import VoxelIndex
 
-    _, points, normals, planarity, variance = tof.map_arrays
+    _, surface, variance = tof.map_arrays
+    points, normals = surface[:, :3], surface[:, 3:6]
     cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     octants = (normals > 0.0) @ np.array([1, 2, 4])
     keys = np.ravel_multi_index((*cells.T, octants), (*(cells.max(axis=0) + 1), 8))
     order = np.argsort(keys, kind='stable')
     kept = order[np.flatnonzero(np.diff(keys[order], prepend=-1))]
     index = VoxelIndex(points[kept], normals[kept], reach=reach)
-    return (
-        index.arrays,
-        *(np.ascontiguousarray(x[kept]) for x in (points, normals, planarity)),
-        variance,
-    )
+    return index.arrays, surface[kept], variance
 
 
 def place(grid: Grid, column: Column, T_map_base: np.ndarray, strain: np.ndarray) -> Column:
@@ -401,9 +398,7 @@ def _score(
     rays,
     variance,
     arrays,
-    cloud,
-    normals,
-    planarity,
+    surface,
     map_variance,
     floor2,
     cauchy,
@@ -411,21 +406,19 @@ def _score(
     min_cosine,
 ):
     """Robust cost (M,) of the frames at each pose T (M, 4, 4)."""
-    H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.empty(q.shape[1], np.int64)
+    H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.full(q.shape[:2], -1)
     out = np.zeros(T.shape[0])
     for m in range(T.shape[0]):
         for f in range(q.shape[0]):
-            associate(T[m], q[f], rays[f], variance[f], arrays, gate, min_cosine, hits)
+            associate(T[m], q[f], rays[f], variance[f], arrays, surface, gate, min_cosine, hits[f])
             cost, _, _ = frame_information(
                 T[m],
                 q[f],
                 rays[f],
                 variance[f],
-                hits,
+                hits[f],
                 1.0,
-                cloud,
-                normals,
-                planarity,
+                surface,
                 map_variance,
                 floor2,
                 0.0,

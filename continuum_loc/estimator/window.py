@@ -18,10 +18,16 @@ from dataclasses import dataclass, replace
 from continuum_loc.estimator.chain import Chain, Message, SingularError
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.output import Body, body_between, motion_bridge, motion_jacobians
+from continuum_loc.estimator.output import (
+    blended_step,
+    Body,
+    body_between,
+    motion_bridge,
+    motion_jacobians,
+)
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE
 import numpy as np
 
 TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
@@ -171,17 +177,20 @@ class Window:
 
     # ------------------------------------------------------------------ Gauss-Newton
 
-    def track(self) -> tuple[int, bool]:
+    def track(self, time: float | None = None) -> tuple[int, bool]:
         """
         Iterate from next to the minimum: (iterations, whether it converged).
 
+        `time`: the newest instant that will be asked for; by default that of the newest column.
+        The columns around it are judged by the body there: ahead of the data the newest one swings
+        from iteration to iteration with the weight of its step, and nobody hears of it.
         Raises SingularError.
         """
         first, limit = len(self.intervals), self.settings.solver.max_iterations
         for iteration in range(1, limit + 1):
             first = min(first, self._linearise())
             offsets = self._solve(first, 0.0)
-            move = self._largest_move(offsets)
+            move = self._largest_move(offsets, time)
             first = self._move(offsets)
             if move < self.settings.solver.tolerance or first == len(self.intervals):
                 return iteration, True  # what was linearised where it is, is solved exactly
@@ -234,7 +243,8 @@ class Window:
     def _move(self, offsets: list[np.ndarray]) -> int:
         """Take the offsets, relinearise columns that moved far; the first interval affected."""
         first = len(self.intervals)
-        far = self._pose_moves(offsets) >= self.settings.solver.relinearise
+        moves = np.abs(self._by_node(offsets)[:, :, POSE : POSE + 6]).max(axis=(1, 2))
+        far = moves >= self.settings.solver.relinearise
         for k, offset in enumerate(offsets):
             if (k == 0 and self.pinned) or not far[k]:
                 self.offsets[k] = offset
@@ -258,13 +268,21 @@ class Window:
         if moved[0]:
             self.chain.messages[0] = self._start_message()
 
-    def _largest_move(self, offsets: list[np.ndarray]) -> float:
-        return float(np.max(self._pose_moves(np.array(offsets) - np.array(self.offsets))))
+    def _largest_move(self, offsets: list[np.ndarray], time: float | None = None) -> float:
+        """Largest pose component [m, rad] of the step to these offsets, up to `time`."""
+        step = self._by_node(offsets) - self._by_node(self.offsets)
+        pose = step[:, :, POSE : POSE + 6]
+        if time is not None:
+            k = self.knot_before(time)
+            a, b = self.columns[k].time, self.columns[k + 1].time
+            pose = pose[: k + 2]
+            pose[k + 1] = blended_step(step[k], step[k + 1], b - a, time - a)
+        return float(np.abs(pose).max())
 
-    def _pose_moves(self, offsets: list[np.ndarray] | np.ndarray) -> np.ndarray:
-        """(K,) largest pose component [m, rad] of each column's offset."""
-        nodes = np.asarray(offsets)[:, : self.grid.bias_offset].reshape(len(offsets), -1, NODE_DIM)
-        return np.abs(nodes[:, :, :6]).max(axis=(1, 2))
+    def _by_node(self, offsets: list[np.ndarray]) -> np.ndarray:
+        """(K, N, 18) offsets of the columns' nodes."""
+        nodes = np.array(offsets)[:, : self.grid.bias_offset]
+        return nodes.reshape(len(offsets), -1, NODE_DIM)
 
     def _cost(self) -> float:
         """Robust cost where linearised, and by the quadratic model at the offsets."""

@@ -169,7 +169,7 @@ def _add(
     """
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((6, 24))
     J, index = np.zeros((3, 27)), np.empty(27, np.int64)
     H_imu, g_imu = np.zeros((27, 27)), np.zeros(27)
     size, c2 = H.shape[0] // 2, cauchy * cauchy
@@ -225,7 +225,7 @@ def _add_clocks(
     """Add each sample's slope, information and coupling; the slope is the angular acceleration."""
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((6, 24))
     before, after, index = np.empty(6), np.empty(6), np.empty(24, np.int64)
     related = -1
     for m in range(times.shape[0]):

@@ -121,7 +121,7 @@ def _add(
 ):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((6, 24))
     stations = segments.shape[0]
     local = np.zeros((stations, 4, 4))  # information of [bending at a; bending at b]
     slope = np.zeros((stations, 4))

@@ -23,7 +23,7 @@ from continuum_loc.estimator.factors.base import (
     Repeats,
 )
 from continuum_loc.estimator.state import VELOCITY
-from continuum_loc.mapping.voxel_index import nearest_facing_batch
+from continuum_loc.mapping.voxel_index import nearest_facing_batch, surface_rows
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from numba import njit
 import numpy as np
@@ -59,16 +59,15 @@ class TofFactor(Factor):
         self._names = list(self._sensors)
         self.index = index
         self._repeats = Repeats(MOST_REPEATS)
+        self._associations: dict[int, Association] = {}  # of each sensor's newest frame
         if prior_map is not None:
-            self._cloud, self._normals = (
-                np.ascontiguousarray(prior_map.points),
-                np.ascontiguousarray(prior_map.normals),
-            )
             # A flat patch of scattered points has 0.8 to 0.9, which counts as whole: as a share of
             # the information it would make the covariance too large.
             flat = max(float(np.median(prior_map.planarity)), 1e-9)
             alpha = np.minimum(prior_map.planarity / flat, 1.0)
-            self._planarity = alpha**settings.tof.planarity_power
+            self.surface = surface_rows(
+                prior_map.points, prior_map.normals, alpha**settings.tof.planarity_power
+            )
             self._map_variance = prior_map.sigma**2
         model = robot.tof_model
         self._noise_distance = np.array(model.noise_distance)
@@ -77,8 +76,8 @@ class TofFactor(Factor):
 
     @property
     def map_arrays(self) -> tuple:
-        """Return what the kernels need of the map: lookup, points, normals, weights, variance."""
-        return self.index.arrays, self._cloud, self._normals, self._planarity, self._map_variance
+        """Return what the kernels need of the map: lookup, surface and its variance."""
+        return self.index.arrays, self.surface, self._map_variance
 
     def row(self, measurement: TofFrame) -> tuple:
         number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, 'ToF')
@@ -110,7 +109,9 @@ class TofFactor(Factor):
             raise MeasurementError(
                 'frozen', f"ToF sensor '{measurement.sensor}' repeats itself to the last bit"
             )
-        return number, node, q, rays, variance, Association(len(points))
+        before = self._associations.get(number)
+        self._associations[number] = Association(len(points), before)
+        return number, node, q, rays, variance, self._associations[number]
 
     def stack(self, times, rows):
         """
@@ -217,13 +218,14 @@ class Association:
     """
     Map points that a frame's zones were matched to, and the pose at which.
 
-    Its last element holds the gate, so that another gate associates anew.
+    Its last element holds the gate, so that another gate associates anew. A new frame's zones are
+    likely to hit what those of the one `before` hit: that is where their lookup begins.
     """
 
     __slots__ = ('T_map_body', 'hits')
 
-    def __init__(self, zones: int):
-        self.hits = np.full(zones, -1, np.int64)
+    def __init__(self, zones: int, before: Association | None = None):
+        self.hits = np.full(zones, -1, np.int64) if before is None else before.hits.copy()
         self.T_map_body = np.zeros((4, 4))
 
 
@@ -291,9 +293,7 @@ def _add(
     variance,
     weights,
     arrays,
-    cloud,
-    normals,
-    planarity,
+    surface,
     map_variance,
     floor2,
     footprint,
@@ -307,7 +307,7 @@ def _add(
 ):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((0, 24))
     index, work = np.empty(24, np.int64), np.empty((6, 24))
     H_body, g_body, H_node, g_node = (
         np.empty((6, 6)),
@@ -324,7 +324,7 @@ def _add(
             related = n
         gp.evaluate(T_a[n], v_a[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
         if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
-            associate(T, q[f], rays[f], variance[f], arrays, gate, min_cosine, hits[f])
+            associate(T, q[f], rays[f], variance[f], arrays, surface, gate, min_cosine, hits[f])
             poses[f] = T
             poses[f, 3, 3] = gate
         frame_cost, frame_squared, frame_count = frame_information(
@@ -334,9 +334,7 @@ def _add(
             variance[f],
             hits[f],
             weights[f],
-            cloud,
-            normals,
-            planarity,
+            surface,
             map_variance,
             floor2,
             footprint,
@@ -373,9 +371,7 @@ def _add_clocks(
     rays,
     variance,
     weights,
-    cloud,
-    normals,
-    planarity,
+    surface,
     map_variance,
     floor2,
     footprint,
@@ -386,7 +382,7 @@ def _add_clocks(
     """Add each frame's v^T g, v^T H v and J^T H v to its sensor's, v the body's velocity then."""
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((0, 24))
     index, fit = np.empty(24, np.int64), np.empty(2)
     H, g, Hv = np.empty((6, 6)), np.empty(6), np.empty(6)
     related = -1
@@ -403,9 +399,7 @@ def _add_clocks(
             variance[f],
             hits[f],
             weights[f],
-            cloud,
-            normals,
-            planarity,
+            surface,
             map_variance,
             floor2,
             footprint,
@@ -425,11 +419,11 @@ def _add_clocks(
 
 
 @njit(cache=True)
-def associate(T, q, rays, variance, arrays, gate, min_cosine, hits):
+def associate(T, q, rays, variance, arrays, surface, gate, min_cosine, hits):
     """
     Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body.
 
-    -1 where there is none.
+    -1 where there is none. On entry, what they may be: earlier ones, or -1.
     """
     zones = q.shape[0]
     points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
@@ -442,7 +436,7 @@ def associate(T, q, rays, variance, arrays, gate, min_cosine, hits):
                 else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
             )
             directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
-    nearest_facing_batch(arrays, points, directions, gate, min_cosine, hits, distance2)
+    nearest_facing_batch(arrays, surface, points, directions, gate, min_cosine, hits, distance2)
 
 
 @njit(cache=True)
@@ -453,9 +447,7 @@ def frame_information(
     variance,
     hits,
     weight,
-    cloud,
-    normals,
-    planarity,
+    surface,
     map_variance,
     floor2,
     footprint,
@@ -490,8 +482,8 @@ def frame_information(
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
         w = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-        nx, ny, nz = normals[hit, 0], normals[hit, 1], normals[hit, 2]
-        r = nx * (x - cloud[hit, 0]) + ny * (y - cloud[hit, 1]) + nz * (w - cloud[hit, 2])
+        nx, ny, nz = surface[hit, 3], surface[hit, 4], surface[hit, 5]
+        r = nx * (x - surface[hit, 0]) + ny * (y - surface[hit, 1]) + nz * (w - surface[hit, 2])
         row[0] = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
         row[1] = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
         row[2] = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
@@ -501,7 +493,7 @@ def frame_information(
         total = variance[z] * cosine2 + spread * spread * (1.0 - cosine2) + floor2 + map_variance
         u2 = r * r / total
         robust = 1.0 / (1.0 + u2 / c2)
-        alpha = weight * planarity[hit]
+        alpha = weight * surface[hit, 6]
         information = alpha * robust / total
         row[3] = b * row[2] - c * row[1]
         row[4] = c * row[0] - a * row[2]
