@@ -232,7 +232,9 @@ class Recovery:
         for strain in self._shapes.find(present.T[0], Snapshot.of(rows)):
             window.place(place(window.grid, present, present.T[0], strain))
             tries.append(self._refine())
-        chosen = min((one for one in tries if self._beats(one, mine)), key=_cost, default=mine)
+        slack = 0.0 if past is None else SHARE_SLACK  # a body that was tracked is not lightly left
+        better = [one for one in tries if self._beats(one, mine, slack)]
+        chosen = min(better, key=_cost, default=mine)
         if past is not None and chosen is mine:
             window.restore(past)  # nothing better was found: what was known before still is
         else:
@@ -241,16 +243,16 @@ class Recovery:
         self.acquired = True
         return not any(self._rivals(one, chosen) for one in tries)
 
-    def _beats(self, other: Try, mine: Try) -> bool:
+    def _beats(self, other: Try, mine: Try, slack: float) -> bool:
         """
-        Whether another body is better: it costs clearly less, and more fits it.
+        Whether another body is better: it costs clearly less, and more fits it, by over `slack`.
 
         Cost alone misleads where the map lacks something: zones without a match near the right
         body cost more than zones that lie a little off in a wrong one, where no sensor fits
         wholly.
         """
         cheaper = other.cost * (1.0 + self._settings.margin) < mine.cost
-        return cheaper and other.share > mine.share and other.whole >= mine.whole
+        return cheaper and other.share > mine.share + slack and other.whole >= mine.whole
 
     def _rivals(self, other: Try, chosen: Try) -> bool:
         """Whether another body, somewhere else, explains about as much."""
