@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import ceil
 
 from continuum_loc.estimator.chain import Chain, Message, SingularError
 from continuum_loc.estimator.factors import Factor
@@ -89,7 +90,7 @@ class Window:
         """Return the interval (t_k, t_k+1] that holds `time`; new knots are appended as needed."""
         while time > self.columns[-1].time + TIME_EPSILON or not self.intervals:
             self._append()
-        k = int(np.ceil((time - self.columns[0].time) / self.settings.knot_period - 1e-6)) - 1
+        k = ceil((time - self.columns[0].time) / self.settings.knot_period - 1e-6) - 1
         return self.intervals[min(max(k, 0), len(self.intervals) - 1)]
 
     def _append(self) -> None:

@@ -119,7 +119,7 @@ class Repeats:
 
 def require_finite(values: np.ndarray, what: str, sensor: str) -> None:
     """Raise MeasurementError unless every value is finite."""
-    if not np.all(np.isfinite(values)):
+    if not np.isfinite(values).all():
         raise MeasurementError(
             'not finite', f"{what} of '{sensor}' is not finite: {np.asarray(values).tolist()}"
         )

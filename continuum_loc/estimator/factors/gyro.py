@@ -49,7 +49,7 @@ class GyroFactor(Factor):
     def row(self, measurement: ImuSample) -> tuple:
         number, node, R_ring_imu = known_sensor(self._imus, measurement.sensor, 'IMU')
         require_finite(measurement.angular_velocity, 'angular velocity', measurement.sensor)
-        if np.max(np.abs(measurement.angular_velocity)) > self.robot.imu_model.gyro_range:
+        if np.abs(measurement.angular_velocity).max() > self.robot.imu_model.gyro_range:
             raise MeasurementError(
                 'saturated',
                 f"gyro '{measurement.sensor}' beyond its full scale of "
