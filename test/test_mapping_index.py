@@ -179,31 +179,6 @@ def test_copies_share_the_cloud_and_not_the_cache():
     assert twin.arrays.points is index.arrays.points
 
 
-@settings(max_examples=60, deadline=None)
-@given(clouds(), clouds(), st.integers(0, 2**32 - 1), st.sampled_from([0.05, 0.3, np.inf]))
-def test_a_guess_changes_no_answer(points, queries, seed, max_distance):
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=points.shape)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    beams = -normals[rng.integers(0, len(points), len(queries))]
-    index = VoxelIndex(points, normals, reach=0.2)
-    for _ in range(PATIENCE + 1):
-        guess = rng.integers(-1, len(points), len(queries))
-        plain, guessed = (index.nearest(queries, max_distance, g) for g in (None, guess))
-        np.testing.assert_array_equal(plain, guessed)
-        plain, guessed = (
-            index.nearest_facing(queries, beams, max_distance, 0.3, g) for g in (None, guess)
-        )
-        np.testing.assert_array_equal(plain, guessed)
-
-
-@pytest.mark.parametrize('guess', [[0], [0, 2], [-2, 0], [[0, 0]]])
-def test_a_guess_that_is_no_row_is_refused(guess):
-    index = VoxelIndex(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
-    with pytest.raises(MapError, match='guess must be 2 rows from -1 to 1'):
-        index.nearest(np.zeros((2, 3)), guess=np.array(guess))
-
-
 @pytest.mark.parametrize('query', [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300]])
 def test_a_query_that_is_no_place_has_no_neighbour(query):
     row, distance = VoxelIndex(np.zeros((1, 3)), cell=0.1).nearest(np.array([query]))

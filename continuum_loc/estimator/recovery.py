@@ -408,17 +408,17 @@ def _score(
     min_cosine,
 ):
     """Robust cost (M,) of the frames at each pose T (M, 4, 4)."""
-    H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.full(q.shape[:2], -1)
+    H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.empty(q.shape[1], np.int64)
     out = np.zeros(T.shape[0])
     for m in range(T.shape[0]):
         for f in range(q.shape[0]):
-            associate(T[m], q[f], rays[f], variance[f], arrays, surface, gate, min_cosine, hits[f])
+            associate(T[m], q[f], rays[f], variance[f], arrays, gate, min_cosine, hits)
             cost, _, _ = frame_information(
                 T[m],
                 q[f],
                 rays[f],
                 variance[f],
-                hits[f],
+                hits,
                 1.0,
                 surface,
                 map_variance,

@@ -40,9 +40,11 @@ AXIS_LIMIT = 1 << (AXIS_BITS - 1)
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
 FIRST_REACH = 0.25  # blocks that a search looks around at first
-PATIENCE = 24  # visits to a cell before it gets a list, which costs as much as a hundred searches
+PATIENCE = (
+    24  # visits to a cell before it gets a list, which costs as much as a dozen searches and
+)
+# pays where one comes back again and again: a body that moves on visits most cells a few times
 CROWDED = -1000  # entry of a cell whose list would be too long
-TINY = 1e-300  # [m^2]
 ROUNDING = 1e-9  # far above the rounding of coordinates counted in blocks
 COUNTERS = (
     2  # rows after the cell table: [lists kept, pool rows in use], [lists made, times emptied]
@@ -515,23 +517,8 @@ def _facing_listed(pool, normals, begin, end, x, y, z, dx, dy, dz, min_cos, limi
     return best, best2
 
 
-@njit(cache=True, inline='always')
-def _guessed2(surface, guess, x, y, z, dx, dy, dz, min_cos):
-    """Squared distance that the answer cannot exceed: the guessed row's, where it faces."""
-    if guess < 0:
-        return np.inf
-    if min_cos > -1.0:
-        nx, ny, nz = surface[guess, 3], surface[guess, 4], surface[guess, 5]
-        if -(nx * dx + ny * dy + nz * dz) < min_cos:
-            return np.inf
-    # A lookup finds what is strictly nearer, and must find the guess itself too.
-    return _distance2(surface, guess, x, y, z) * (1.0 + ROUNDING) + TINY
-
-
 @njit(cache=True)
-def _nearest_batch(
-    arrays, surface, facing, queries, directions, max_distance, min_cos, index, distance2
-):
+def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, index, distance2):
     """
     Find the nearest point to each query (Q, 3); where `facing`, of those that face its direction.
 
@@ -544,10 +531,9 @@ def _nearest_batch(
         arrays.reach,
     )
     x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_cell
-    mask, farthest2 = slots.shape[0] - COUNTERS - 1, max_distance * max_distance
+    mask, limit2 = slots.shape[0] - COUNTERS - 1, max_distance * max_distance
     dx, dy, dz, cone = 0.0, 0.0, 0.0, ANY_DIRECTION
     for q in range(queries.shape[0]):
-        guess = index[q]
         index[q], distance2[q] = -1, np.inf
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         if facing:
@@ -560,7 +546,6 @@ def _nearest_batch(
         entry = slots[slot, 1]
         if slots[slot, 0] != key or entry < 0:
             entry = _visit(arrays, key, slot, min_cos)
-        limit2 = min(farthest2, _guessed2(surface, guess, x, y, z, dx, dy, dz, min_cos))
         best, best2 = -1, limit2
         begin, end = entry >> 16, (entry >> 16) + (entry & 0xFFFF)
         if entry >= 0 and facing:
@@ -579,21 +564,18 @@ def _nearest_batch(
 
 
 @njit(cache=True)
-def nearest_batch(arrays, surface, queries, max_distance, index, distance2):
+def nearest_batch(arrays, queries, max_distance, index, distance2):
     """
     Find the nearest points to queries (Q, 3): their rows index (Q,) and distance2 (Q,) [m^2].
 
-    The rows are those of `surface` (P, 8), the caller's; -1 and inf where none lies strictly
-    within `max_distance` [m] or a query is not finite. On entry `index` holds a guess for each,
-    such as the last answer, or -1: the nearer it is, the sooner the same answer is found.
+    The rows are the caller's; -1 and inf where none lies strictly within `max_distance` [m] or a
+    query is not finite.
     """
-    _nearest_batch(arrays, surface, False, queries, queries, max_distance, -1.0, index, distance2)
+    _nearest_batch(arrays, False, queries, queries, max_distance, -1.0, index, distance2)
 
 
 @njit(cache=True)
-def nearest_facing_batch(
-    arrays, surface, queries, directions, max_distance, min_cos, index, distance2
-):
+def nearest_facing_batch(arrays, queries, directions, max_distance, min_cos, index, distance2):
     """
     As `nearest_batch`, among the points whose outward normal n has -(n . d) >= min_cos.
 
@@ -602,12 +584,7 @@ def nearest_facing_batch(
     if arrays.made_for[0] != min_cos:
         _empty(arrays.cell_slots)
         arrays.made_for[0] = min_cos
-    _nearest_batch(
-        arrays, surface, True, queries, directions, max_distance, min_cos, index, distance2
-    )
-
-
-NO_SURFACE = np.empty((0, 8))
+    _nearest_batch(arrays, True, queries, directions, max_distance, min_cos, index, distance2)
 
 
 class VoxelIndex:
@@ -634,7 +611,6 @@ class VoxelIndex:
         if given.shape != points.shape:
             raise MapError(f'normals {given.shape} must match points {points.shape}')
         self._has_normals = normals is not None
-        self._rows, self._guessable = (points, given), None
         self.cell = float(cell) if cell is not None else _suitable_cell(points)
         if not self.cell > 0.0 or not reach >= 0.0:
             raise MapError(f'cell must be > 0 and reach >= 0, got cell {cell!r}, reach {reach!r}')
@@ -668,23 +644,17 @@ class VoxelIndex:
         )
 
     def nearest(
-        self,
-        queries: np.ndarray,
-        max_distance: float = np.inf,
-        guess: np.ndarray | None = None,
+        self, queries: np.ndarray, max_distance: float = np.inf
     ) -> tuple[np.ndarray, np.ndarray]:
         """
         Rows (Q,) of the nearest points and distances (Q,) [m] for queries (Q, 3).
 
         They are -1 and inf where none is nearer than max_distance [m]. Of equally near points the
-        first is taken. guess: rows (Q,), such as the last answers, or -1; a near one saves time
-        and changes nothing. Raises MapError for a guess of another shape or off the cloud.
+        first is taken.
         """
         queries = np.ascontiguousarray(queries, dtype=np.float64)
-        index, distance2 = self._guess(guess, len(queries)), np.empty(len(queries))
-        nearest_batch(
-            self.arrays, self._surface(guess), queries, float(max_distance), index, distance2
-        )
+        index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
+        nearest_batch(self.arrays, queries, float(max_distance), index, distance2)
         return index, np.sqrt(distance2)
 
     def nearest_facing(
@@ -693,7 +663,6 @@ class VoxelIndex:
         directions: np.ndarray,
         max_distance: float = np.inf,
         min_cos: float = 0.0,
-        guess: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
         As `nearest`, among points whose normals face the rays.
@@ -706,10 +675,9 @@ class VoxelIndex:
         directions = np.ascontiguousarray(
             np.broadcast_to(directions, queries.shape), dtype=np.float64
         )
-        index, distance2 = self._guess(guess, len(queries)), np.empty(len(queries))
+        index, distance2 = np.empty(len(queries), np.int64), np.empty(len(queries))
         nearest_facing_batch(
             self.arrays,
-            self._surface(guess),
             queries,
             directions,
             float(max_distance),
@@ -718,41 +686,6 @@ class VoxelIndex:
             distance2,
         )
         return index, np.sqrt(distance2)
-
-    def _surface(self, guess: np.ndarray | None) -> np.ndarray:
-        """Rows that guesses refer to, made when the first ones are given."""
-        if guess is None:
-            return NO_SURFACE
-        if self._guessable is None:
-            self._guessable = surface_rows(*self._rows)
-        return self._guessable
-
-    def _guess(self, rows: np.ndarray | None, count: int) -> np.ndarray:
-        """Copy of guessed rows (count,), checked; -1 where there are none."""
-        if rows is None:
-            return np.full(count, -1, np.int64)
-        rows = np.array(rows, dtype=np.int64)
-        if rows.shape != (count,) or (
-            count and not -1 <= rows.min() <= rows.max() < len(self._rows[0])
-        ):
-            raise MapError(
-                f'guess must be {count} rows from -1 to {len(self._rows[0]) - 1}, got {rows.shape}'
-                + (f' from {rows.min()} to {rows.max()}' if rows.size else '')
-            )
-        return rows
-
-
-def surface_rows(
-    points: np.ndarray, normals: np.ndarray, weights: np.ndarray | float = 1.0
-) -> np.ndarray:
-    """
-    (P, 8) point, normal, weight and nothing: all that is asked of a row lies side by side.
-
-    A row is as long as a line of the cache, so that a kernel that uses it waits once.
-    """
-    rows = np.zeros((len(points), 8))
-    rows[:, :3], rows[:, 3:6], rows[:, 6] = points, normals, weights
-    return rows
 
 
 def _checked_rows(rows: np.ndarray, name: str) -> np.ndarray:

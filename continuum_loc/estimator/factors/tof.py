@@ -23,7 +23,7 @@ from continuum_loc.estimator.factors.base import (
     Repeats,
 )
 from continuum_loc.estimator.state import VELOCITY
-from continuum_loc.mapping.voxel_index import nearest_facing_batch, surface_rows
+from continuum_loc.mapping.voxel_index import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from numba import njit
 import numpy as np
@@ -59,15 +59,13 @@ class TofFactor(Factor):
         self._names = list(self._sensors)
         self.index = index
         self._repeats = Repeats(MOST_REPEATS)
-        self._associations: dict[int, Association] = {}  # of each sensor's newest frame
         if prior_map is not None:
             # A flat patch of scattered points has 0.8 to 0.9, which counts as whole: as a share of
             # the information it would make the covariance too large.
             flat = max(float(np.median(prior_map.planarity)), 1e-9)
             alpha = np.minimum(prior_map.planarity / flat, 1.0)
-            self.surface = surface_rows(
-                prior_map.points, prior_map.normals, alpha**settings.tof.planarity_power
-            )
+            weight = alpha**settings.tof.planarity_power
+            self.surface = np.column_stack([prior_map.points, prior_map.normals, weight])
             self._map_variance = prior_map.sigma**2
         model = robot.tof_model
         self._noise_distance = np.array(model.noise_distance)
@@ -76,7 +74,7 @@ class TofFactor(Factor):
 
     @property
     def map_arrays(self) -> tuple:
-        """Return what the kernels need of the map: lookup, surface and its variance."""
+        """Lookup, surface (P, 7) of points, normals and weights, and its variance."""
         return self.index.arrays, self.surface, self._map_variance
 
     def row(self, measurement: TofFrame) -> tuple:
@@ -109,9 +107,7 @@ class TofFactor(Factor):
             raise MeasurementError(
                 'frozen', f"ToF sensor '{measurement.sensor}' repeats itself to the last bit"
             )
-        before = self._associations.get(number)
-        self._associations[number] = Association(len(points), before)
-        return number, node, q, rays, variance, self._associations[number]
+        return number, node, q, rays, variance, Association(len(points))
 
     def stack(self, times, rows):
         """
@@ -218,14 +214,13 @@ class Association:
     """
     Map points that a frame's zones were matched to, and the pose at which.
 
-    Its last element holds the gate, so that another gate associates anew. A new frame's zones are
-    likely to hit what those of the one `before` hit: that is where their lookup begins.
+    Its last element holds the gate, so that another gate associates anew.
     """
 
     __slots__ = ('T_map_body', 'hits')
 
-    def __init__(self, zones: int, before: Association | None = None):
-        self.hits = np.full(zones, -1, np.int64) if before is None else before.hits.copy()
+    def __init__(self, zones: int):
+        self.hits = np.full(zones, -1, np.int64)
         self.T_map_body = np.zeros((4, 4))
 
 
@@ -324,7 +319,7 @@ def _add(
             related = n
         gp.evaluate(T_a[n], v_a[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
         if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
-            associate(T, q[f], rays[f], variance[f], arrays, surface, gate, min_cosine, hits[f])
+            associate(T, q[f], rays[f], variance[f], arrays, gate, min_cosine, hits[f])
             poses[f] = T
             poses[f, 3, 3] = gate
         frame_cost, frame_squared, frame_count = frame_information(
@@ -419,11 +414,11 @@ def _add_clocks(
 
 
 @njit(cache=True)
-def associate(T, q, rays, variance, arrays, surface, gate, min_cosine, hits):
+def associate(T, q, rays, variance, arrays, gate, min_cosine, hits):
     """
     Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body.
 
-    -1 where there is none. On entry, what they may be: earlier ones, or -1.
+    -1 where there is none.
     """
     zones = q.shape[0]
     points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
@@ -436,7 +431,7 @@ def associate(T, q, rays, variance, arrays, surface, gate, min_cosine, hits):
                 else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
             )
             directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
-    nearest_facing_batch(arrays, surface, points, directions, gate, min_cosine, hits, distance2)
+    nearest_facing_batch(arrays, points, directions, gate, min_cosine, hits, distance2)
 
 
 @njit(cache=True)
