@@ -13,6 +13,7 @@ from continuum_loc.estimator import (
     SlidingWindowFilter,
     smooth,
 )
+from continuum_loc.estimator.recovery import SHARE_SLACK, Try
 from continuum_loc.measurements import ImuSample, StrainSample, TofFrame, TruthSample
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
@@ -217,6 +218,33 @@ def test_finds_itself_from_the_base_alone(prior_map, seed):
     filter_ = SlidingWindowFilter(robot, prior_map, settings(recovery={'max_curvature': 2.0}))
     estimates, truth = run(filter_, stream(motion, 1.0, start=2.0))
     assert np.max(np.abs(errors(estimates, truth)[-5:, 1:, :3])) < 0.01
+
+
+def test_an_estimate_that_is_called_converged_stays_where_it_is_when_solved_on(prior_map):
+    """Convergence is judged at the estimate's stamp, not at the column ahead of the data."""
+    robot, moved = rod(), []
+    filter_ = SlidingWindowFilter(robot, prior_map, settings(solver={'relinearise': 1e-9}))
+    for sample in stream(Rod(robot, amplitude=2.0), 3.0):
+        estimate = None if isinstance(sample, TruthSample) else filter_.process(sample)
+        if estimate is not None and estimate.converged:
+            filter_.window.track()
+            later = filter_.window.body((estimate.stamp - filter_.epoch) / 1e9)
+            step = lie.log(lie.inverse(estimate.T_map_ring) @ later.T[filter_.grid.ring_nodes])
+            moved.append(np.abs(step).max())
+    assert len(moved) > 30
+    settled = moved[10:]  # the biases that the initial rest tells enter after a solve
+    assert max(settled) < 2.0 * filter_.settings.solver.tolerance
+
+
+def test_a_tracked_body_is_not_left_for_one_that_fits_no_more(prior_map):
+    """It would jump to a rival where the map lacks something: cost alone tells too little."""
+    recovery = SlidingWindowFilter(rod(), prior_map, settings()).recovery
+    mine, rival = Try(1246.0, 0.853, 7, []), Try(1101.0, 0.858, 7, [])
+    better = replace(rival, share=0.93)
+    assert recovery._beats(better, mine, SHARE_SLACK)
+    assert not recovery._beats(rival, mine, SHARE_SLACK)
+    assert recovery._beats(rival, mine, 0.0)  # which one a body that is still sought may take
+    assert not recovery._beats(replace(better, whole=6), mine, 0.0)
 
 
 def test_memory_is_bounded(prior_map):
