@@ -4,9 +4,10 @@ Test the chain against dense algebra.
 Solution, covariances, and marginalisation equal to the batch.
 """
 
-from continuum_loc.estimator.chain import Blocks, Chain, Message, SingularError
+from continuum_loc.estimator.chain import BLOCK, Blocks, Chain, Cholesky, Message, SingularError
 import numpy as np
 import pytest
+from scipy.linalg import solve_triangular
 
 D, K = 7, 6
 
@@ -51,6 +52,20 @@ def test_solution_and_covariances_equal_dense_algebra(seed):
         )
         alone = slice(D * k, D * (k + 1))
         np.testing.assert_allclose(chain.covariance(k, A), A @ P[alone, alone] @ A.T, atol=1e-9)
+
+
+@pytest.mark.parametrize('size', [1, BLOCK - 1, BLOCK, BLOCK + 1, 4 * BLOCK - 3])
+def test_solving_by_blocks_is_as_exact_as_solving_row_by_row(size):
+    """Scales from metres to strains and gyro biases, with many directions hardly observed."""
+    rng = np.random.default_rng(size)
+    A = rng.normal(size=(size, size)) * 10.0 ** rng.uniform(-3.0, 3.0, size)
+    H = A.T @ A + 1e-9 * np.diag(np.sum(A * A, axis=0))
+    L, B = np.linalg.cholesky(H), rng.normal(size=(size, 5))
+    X = Cholesky(np.asfortranarray(L)).whiten(B)
+    # Backward error, the measure of a stable solver: L X = B to rounding of its largest terms.
+    assert np.abs(L @ X - B).max() <= 1e-13 * size * (np.abs(L) @ np.abs(X) + np.abs(B)).max()
+    expected = solve_triangular(L, B, lower=True)
+    np.testing.assert_allclose(X, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
 def test_marginalising_equals_the_batch_solution():

@@ -12,7 +12,7 @@ the oldest to the newest leaves on each a *message* (Lambda, eta), all that the 
 
 Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the
 message it left. Messages before the first interval that changed are kept from the last solve, and
-covariances come from the same triangular factors (`Factor`).
+covariances come from the same triangular factors (`Cholesky`).
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ class Message:
     gradient: np.ndarray
 
 
-class Factor:
+class Cholesky:
     """
-    Lower Cholesky factor L (D, D) of a positive definite matrix, and solving with it.
+    Lower factor L (D, D) of a positive definite matrix L L^T, and solving with it.
 
     Many right-hand sides are solved by blocks of L's rows: a product with what is solved, then one
     with the inverse of the small diagonal block. Products run at two to three times the speed of
@@ -110,7 +110,7 @@ class Factor:
 class _Elimination:
     """One eliminated column: the factor of S, Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
 
-    factor: Factor
+    factor: Cholesky
     Y: np.ndarray
     y: np.ndarray
 
@@ -122,7 +122,7 @@ class Chain:
         self.dim = dim
         self.messages = [start]
         self._eliminated: list[_Elimination] = []
-        self._last: tuple[Factor, np.ndarray] | None = None
+        self._last: tuple[Cholesky, np.ndarray] | None = None
 
     def solve(
         self, intervals: list[Blocks], first_changed: int, damping: float = 0.0
@@ -168,7 +168,7 @@ class Chain:
                 right = C[k + 1] - self._eliminated[k].Y.T @ y
         return total
 
-    def _factor(self, column: int) -> Factor:
+    def _factor(self, column: int) -> Cholesky:
         if column < len(self._eliminated):
             return self._eliminated[column].factor
         return self._last[0]
@@ -207,13 +207,13 @@ class Chain:
         self.messages.append(Message(_symmetrised(information), g[D:] - Y.T @ y))
 
 
-def _factored(S: np.ndarray, damping: float, column: int) -> Factor:
+def _factored(S: np.ndarray, damping: float, column: int) -> Cholesky:
     if damping > 0.0:
         S = S + damping * np.diag(np.diag(S))
     L, info = lapack.dpotrf(S, lower=1, clean=1)
     if info != 0 or not np.isfinite(L[-1, -1]):
         raise SingularError(column)
-    return Factor(L)
+    return Cholesky(L)
 
 
 def _symmetrised(lower: np.ndarray) -> np.ndarray:
