@@ -463,3 +463,30 @@ def test_stop_ends_it_at_once():
     begin = time.monotonic()
     paced.run(lambda *_: paced.stop())
     assert time.monotonic() - begin < 5.0
+
+
+@pytest.mark.parametrize('fails', [False, True])
+def test_the_preparation_is_over_when_the_delivery_is(fails):
+    """A thread that still steps the physics when the interpreter ends takes the process down."""
+    inside: list[bool] = []
+
+    def items():
+        for k in range(1, 1000):
+            inside.append(True)
+            time.sleep(0.05)  # as a step that takes long
+            inside.pop()
+            yield k * SECOND // 100, None
+
+    def deliver(*_):
+        if fails:
+            raise RuntimeError('no publisher')
+        paced.stop()
+
+    paced = Paced(items(), 0.5)
+    try:
+        paced.run(deliver)
+    except RuntimeError:
+        assert fails
+    assert not inside
+    time.sleep(0.12)
+    assert not inside and not any(t.name == 'lookahead' for t in threading.enumerate())

@@ -49,6 +49,22 @@ class Paced:
         compiled) and due one lookahead from now.
         """
         self._thread.start()
+        try:
+            self._deliver_all(deliver, on_start)
+        finally:
+            # An interpreter that ends under a thread in compiled code, as of physics, crashes.
+            self._stop.set()
+            self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        """End `run` soon."""
+        self._stop.set()
+
+    def _deliver_all(
+        self, deliver: Callable[[int, Any, float], None], on_start: Callable[[int], None]
+    ) -> None:
         while not self._full.wait(POLL) and not self._stop.is_set():
             pass
         begin: float | None = None
@@ -61,12 +77,6 @@ class Paced:
                 break
             self._progress = stamp
             deliver(stamp, item, time.monotonic() - due)
-        if self._error is not None:
-            raise self._error
-
-    def stop(self) -> None:
-        """End `run` soon."""
-        self._stop.set()
 
     def _prepared(self) -> Iterator[tuple[int, Any]]:
         while not self._stop.is_set():

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 import sys
 import threading
-import time
 from typing import Any
 
 from continuum_loc.measurements import nanoseconds
+from continuum_loc.nodes.delivery import await_acknowledged, await_listeners
 from continuum_loc.nodes.pacing import Paced
 from continuum_loc.nodes.runtime import output_qos, PackageNode, run
 from continuum_loc.nodes.settings import ReplayerNodeSettings
@@ -27,7 +27,6 @@ from msg_tools.topics import INPUTS, topic_spec, TOPICS, TRACKER
 from rosgraph_msgs.msg import Clock
 
 LOOKAHEAD = 0.5  # s
-SETTLED_MATCH = 0.5  # s after discovery says that all is matched until the data begins
 CLOCK = '/clock'
 
 
@@ -90,35 +89,29 @@ class ReplayerNode(PackageNode):
 
     def _play(self) -> None:
         try:
-            self._wait_for_listeners()
-            while not self._stop.is_set():
+            going = self._wait_for_listeners()
+            while going and not self._stop.is_set():
                 self._paced = Paced(self._entries(), LOOKAHEAD, self.settings.rate)
                 self._paced.run(self._deliver)
-                if not self.settings.loop:
-                    break
+                going = self.settings.loop
+            if not self._stop.is_set():
+                await_acknowledged(self.outputs.values())
         except BaseException as error:
             if self.context.ok():
                 self._failure = error
         self.finish()
 
-    def _wait_for_listeners(self) -> None:
+    def _wait_for_listeners(self) -> bool:
         """Begin when enough subscriptions listen to the bag's busiest kind of sensor."""
-        first = next(
-            (topic for topic in INPUTS if topic in self.outputs), next(iter(self.outputs))
+        some = next(iter(self.outputs.values()))
+        first = next((self.outputs[topic] for topic in INPUTS if topic in self.outputs), some)
+        return await_listeners(
+            self.outputs.values(),
+            first,
+            self.settings.wait_for,
+            self.settings.wait_timeout,
+            self._stop.is_set,
         )
-        deadline = time.monotonic() + self.settings.wait_timeout
-        while (
-            self.outputs[first].get_subscription_count() < self.settings.wait_for
-            and not self._stop.is_set()
-        ):
-            if time.monotonic() > deadline:
-                raise TimeoutError(
-                    f'fewer than {self.settings.wait_for} subscriptions listen to {first} after '
-                    f'{self.settings.wait_timeout:g} s'
-                )
-            time.sleep(0.02)
-        if self.settings.wait_for:
-            time.sleep(SETTLED_MATCH)
 
     def _entries(self) -> Iterator[tuple[int, tuple[str, bytes]]]:
         """Yield the bag's messages, and ticks of the clock between them."""

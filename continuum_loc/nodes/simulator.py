@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 import sys
 import threading
-import time
 from typing import Any
 
+from continuum_loc.nodes.delivery import await_acknowledged, await_listeners
 from continuum_loc.nodes.pacing import Paced
 from continuum_loc.nodes.runtime import Delays, output_qos, PackageNode, run, write_summary
 from continuum_loc.nodes.settings import SimulatorNodeSettings
@@ -21,8 +21,6 @@ from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
 from msg_tools.topics import topic_of, topic_spec, TRACKER
-
-SETTLED_MATCH = 0.5  # s after discovery says that all is matched until the data begins
 
 
 class SimulatorNode(PackageNode):
@@ -105,6 +103,7 @@ class SimulatorNode(PackageNode):
             if self._wait_for_listeners():
                 self._state = 'running'
                 self._paced.run(self._deliver, self._begin)
+                await_acknowledged(self.outputs.values())
                 self._state = 'finished'
         except BaseException as error:
             if self.context.ok():
@@ -112,21 +111,13 @@ class SimulatorNode(PackageNode):
         self.finish()
 
     def _wait_for_listeners(self) -> bool:
-        sensors = self.outputs['tof/points' if self.robot.tof else 'imu/data_raw']
-        deadline = time.monotonic() + self.settings.wait_timeout
-        while sensors.get_subscription_count() < self.settings.wait_for:
-            if self._state == 'stopped':
-                return False
-            if time.monotonic() > deadline:
-                raise TimeoutError(
-                    f'{sensors.get_subscription_count()} of {self.settings.wait_for} '
-                    f'subscriptions listen to {sensors.topic_name} after '
-                    f'{self.settings.wait_timeout:g} s'
-                )
-            time.sleep(0.02)
-        if self.settings.wait_for:
-            time.sleep(SETTLED_MATCH)
-        return True
+        return await_listeners(
+            self.outputs.values(),
+            self.outputs['tof/points' if self.robot.tof else 'imu/data_raw'],
+            self.settings.wait_for,
+            self.settings.wait_timeout,
+            lambda: self._state == 'stopped',
+        )
 
     def _begin(self, first: int) -> None:
         """
