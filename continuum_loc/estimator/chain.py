@@ -84,15 +84,12 @@ class Cholesky:
 
     def whiten(self, B: np.ndarray) -> np.ndarray:
         """L^-1 B (D, m)."""
-        starts = range(0, len(self.L), BLOCK)
+        blocks = [slice(at, at + BLOCK) for at in range(0, len(self.L), BLOCK)]
         if self._inverses is None:
-            self._inverses = [
-                lapack.dtrtri(self.L[at : at + BLOCK, at : at + BLOCK], lower=1)[0]
-                for at in starts
-            ]
+            self._inverses = [lapack.dtrtri(self.L[rows, rows], lower=1)[0] for rows in blocks]
         X = np.empty(B.shape)
-        for at, inverse in zip(starts, self._inverses, strict=True):
-            rows = slice(at, at + BLOCK)
+        for rows, inverse in zip(blocks, self._inverses, strict=True):
+            at = rows.start
             rest = B[rows] - self.L[rows, :at] @ X[:at] if at else B[rows]
             np.matmul(inverse, rest, out=X[rows])
         return X

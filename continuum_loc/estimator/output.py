@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from continuum_loc import lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE, VELOCITY
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE_PART, VELOCITY_PART
 from numba import njit
 import numpy as np
 
@@ -72,10 +72,10 @@ def blended_step(step_a: np.ndarray, step_b: np.ndarray, d: float, tau: float) -
     u = tau / d
     h1, h2, h3 = u * u * (3.0 - 2.0 * u), u * (1.0 - u) * (1.0 - u) * d, u * u * (u - 1.0) * d
     return (
-        (1.0 - h1) * step_a[:, POSE : POSE + 6]
-        + h2 * step_a[:, VELOCITY : VELOCITY + 6]
-        + h1 * step_b[:, POSE : POSE + 6]
-        + h3 * step_b[:, VELOCITY : VELOCITY + 6]
+        (1.0 - h1) * step_a[:, POSE_PART]
+        + h2 * step_a[:, VELOCITY_PART]
+        + h1 * step_b[:, POSE_PART]
+        + h3 * step_b[:, VELOCITY_PART]
     )
 
 

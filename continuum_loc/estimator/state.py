@@ -18,6 +18,7 @@ import numpy as np
 NODE_DIM = 18
 STEP_LENGTH = 0.004  # [m] over which strain may step at a module's end
 POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
+POSE_PART, VELOCITY_PART = slice(0, 6), slice(12, 18)
 
 
 class Grid:

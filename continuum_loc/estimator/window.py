@@ -28,7 +28,7 @@ from continuum_loc.estimator.output import (
 )
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE_PART
 import numpy as np
 
 TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
@@ -244,7 +244,7 @@ class Window:
     def _move(self, offsets: list[np.ndarray]) -> int:
         """Take the offsets, relinearise columns that moved far; the first interval affected."""
         first = len(self.intervals)
-        moves = np.abs(self._by_node(offsets)[:, :, POSE : POSE + 6]).max(axis=(1, 2))
+        moves = np.abs(self._by_node(offsets)[:, :, POSE_PART]).max(axis=(1, 2))
         far = moves >= self.settings.solver.relinearise
         for k, offset in enumerate(offsets):
             if (k == 0 and self.pinned) or not far[k]:
@@ -272,7 +272,7 @@ class Window:
     def _largest_move(self, offsets: list[np.ndarray], time: float | None = None) -> float:
         """Largest pose component [m, rad] of the step to these offsets, up to `time`."""
         step = self._by_node(offsets) - self._by_node(self.offsets)
-        pose = step[:, :, POSE : POSE + 6]
+        pose = step[:, :, POSE_PART]
         if time is not None:
             k = self.knot_before(time)
             a, b = self.columns[k].time, self.columns[k + 1].time
