@@ -40,10 +40,9 @@ AXIS_LIMIT = 1 << (AXIS_BITS - 1)
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
 FIRST_REACH = 0.25  # blocks that a search looks around at first
-PATIENCE = (
-    24  # visits to a cell before it gets a list, which costs as much as a dozen searches and
-)
-# pays where one comes back again and again: a body that moves on visits most cells a few times
+# Visits to a cell before it gets a list, which costs as much as a dozen searches: a body that
+# moves on visits most cells a few times only; where it stays, each list pays.
+PATIENCE = 24
 CROWDED = -1000  # entry of a cell whose list would be too long
 ROUNDING = 1e-9  # far above the rounding of coordinates counted in blocks
 COUNTERS = (
