@@ -25,7 +25,8 @@ def await_listeners(
     """
     Wait until `count` subscriptions listen to `first` and no more come to any publisher.
 
-    False when stopped() meanwhile. Raises TimeoutError after `timeout` [s].
+    False when stopped() meanwhile. Raises TimeoutError when there are too few after `timeout` [s],
+    or when they still come and go after as long again.
     """
     deadline = time.monotonic() + timeout
     while first.get_subscription_count() < count:
@@ -37,15 +38,21 @@ def await_listeners(
                 f'{first.topic_name} after {timeout:g} s'
             )
         time.sleep(POLL)
-    return count == 0 or _settle(publishers, stopped)
+    return count == 0 or _settle(publishers, max(timeout, 2.0 * SETTLED_MATCH), stopped)
 
 
-def _settle(publishers: Collection[Any], stopped: Callable[[], bool]) -> bool:
+def _settle(publishers: Collection[Any], timeout: float, stopped: Callable[[], bool]) -> bool:
     """Wait until the number of subscriptions stays the same; False when stopped() meanwhile."""
     known, since = None, time.monotonic()
+    deadline = since + timeout
     while time.monotonic() - since < SETTLED_MATCH:
         if stopped():
             return False
+        if time.monotonic() > deadline:
+            raise TimeoutError(
+                f'subscriptions still come and go after {timeout:g} s: none kept its number '
+                f'for {SETTLED_MATCH:g} s'
+            )
         counts = [publisher.get_subscription_count() for publisher in publishers]
         if counts != known:
             known, since = counts, time.monotonic()
