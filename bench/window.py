@@ -253,7 +253,7 @@ def _linearise(T, v, tau, knot, measured, information, period, q_inverse, H, g):
         weighted = J_log.T @ information[f]
         H_body[:] = weighted @ J_log
         g_body[:] = weighted @ residual
-        gp.add_local(H[k], g[k], index, H_body, g_body, J_pose, work)
+        gp.gather(H[k], g[k], H_body, g_body, J_pose, work)
 
 
 @njit(cache=True)

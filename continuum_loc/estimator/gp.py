@@ -259,26 +259,6 @@ def add_rows(H, g, index, e, J, weights):
 
 
 @njit(cache=True)
-def add_local(H, g, index, H_local, g_local, J, work):
-    """
-    Add a local information block (m, m), (m,), chained through J (m, n), at the rows `index`.
-
-    Work (m, n).
-    """
-    _weigh(H_local, J, work)
-    m, n = J.shape
-    for j in range(n):
-        row = index[j]
-        for i in range(m):
-            g[row] += J[i, j] * g_local[i]
-        for k in range(n):
-            total = 0.0
-            for i in range(m):
-                total += J[i, j] * work[i, k]
-            H[row, index[k]] += total
-
-
-@njit(cache=True)
 def gather(H_sum, g_sum, H_local, g_local, J, work):
     """
     Add a local information block (m, m), (m,), chained through J (m, n), to H_sum (n, n), g_sum.

@@ -409,10 +409,14 @@ def _score(
 ):
     """Robust cost (M,) of the frames at each pose T (M, 4, 4)."""
     H, g, fit, hits = np.empty((6, 6)), np.empty(6), np.zeros(2), np.empty(q.shape[1], np.int64)
+    nowhere = np.full((q.shape[1], 4), np.nan)
     out = np.zeros(T.shape[0])
     for m in range(T.shape[0]):
         for f in range(q.shape[0]):
-            associate(T[m], q[f], rays[f], variance[f], arrays, gate, min_cosine, hits)
+            places = nowhere.copy()
+            associate(
+                T[m], q[f], rays[f], variance[f], arrays, gate, min_cosine, 0.0, hits, places
+            )
             cost, _, _ = frame_information(
                 T[m],
                 q[f],

@@ -7,7 +7,7 @@ Each map point is taken as a small disc on its tangent plane.
 from __future__ import annotations
 
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import find_slot, pack, VoxelIndex
+from continuum_loc.mapping.voxel_index import find_slot, pack, span_bounds, VoxelIndex
 from numba import njit
 import numpy as np
 
@@ -68,9 +68,9 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
     the ray does not run, is not seen: a share of about radius / block edge of the surface has
     thinner cover.
     """
-    edge = arrays.block
-    corner = (arrays.x0, arrays.y0, arrays.z0)
-    extent = (arrays.blocks_x, arrays.blocks_y, arrays.blocks_z)
+    lattice = arrays.lattice
+    edge, corner = lattice.block, (lattice.x0, lattice.y0, lattice.z0)
+    extent = (lattice.blocks_x, lattice.blocks_y, lattice.blocks_z)
     at, step, until, stride = start_march(origin, direction, corner, edge)
     best, depth, entered = -1, length, 0.0
     while entered <= depth:
@@ -126,12 +126,11 @@ def next_cell(at, step, until, stride):
 
 
 @njit(cache=True)
-def _cross_block(
-    arrays, block, normals, origin, direction, radius, min_cos, oriented, best, depth
-):
-    """Improve (row, depth) by the discs of one block."""
+def _cross_block(arrays, span, normals, origin, direction, radius, min_cos, oriented, best, depth):
+    """Improve (row, depth) by the discs of the block with this span."""
     points = arrays.points
-    for p in range(arrays.block_start[block], arrays.block_start[block + 1]):
+    first, after = span_bounds(span)
+    for p in range(first, after):
         row = int(points[p, 3])
         toward = -(
             normals[row, 0] * direction[0]

@@ -37,6 +37,8 @@ POINTS_PER_CELL = (
 AXIS_BITS = 19
 AXIS_MASK = (1 << AXIS_BITS) - 1
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)
+SPAN_BITS = 24  # of the length in a block's span
+SPAN_MASK = (1 << SPAN_BITS) - 1
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
 FIRST_REACH = 0.25  # blocks that a search looks around at first
@@ -54,29 +56,9 @@ CONE_SIN = np.sqrt(1.0 - CONE_COS**2)
 CONE_TILT = 0.366  # of the axis of a quarter of a cube's face: (1, tilt, tilt)
 
 
-class VoxelArrays(NamedTuple):
-    """
-    The index as arrays and scalars.
+class Lattice(NamedTuple):
+    """Origin [m] and edges [m] of blocks and cells, with their inverses, and extent in blocks."""
 
-    Kernels take it whole; only the last five arrays are ever written.
-
-    points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; normals: (P, 3).
-    block_slots: (H, 2) hash table from a block's key to its number.
-    block_start: (B + 1,) first sorted point of each block; block_at: (B, 3) its place in blocks.
-    x0, y0, z0: origin [m]; block, cell: edges [m]; blocks_x, blocks_y, blocks_z: extent in blocks;
-    reach: distance [m] up to which lists are made.
-    cell_slots: (C + COUNTERS, 2) hash table from a cell's and cone's key to their packed list
-        (start * 2^16 + length), to minus the number of visits so far, or to CROWDED.
-    pool, pool_normals: (L, 4), (L, 3) the lists end to end: rows of `points` and `normals`.
-    scratch: (B,) blocks that a search is about to look at.
-    made_for: (1,) the `min_cos` that facing lists are kept for; another empties the cache.
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    block_slots: np.ndarray
-    block_start: np.ndarray
-    block_at: np.ndarray
     x0: float
     y0: float
     z0: float
@@ -87,11 +69,40 @@ class VoxelArrays(NamedTuple):
     blocks_x: int
     blocks_y: int
     blocks_z: int
+
+
+class VoxelArrays(NamedTuple):
+    """
+    The index as arrays.
+
+    Kernels take it whole and unpack it outside their loops: handing so many arrays on takes
+    longer than most lookups. Only the last six arrays are ever written.
+
+    points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; normals: (P, 3).
+    block_slots: (H, 2) hash table from a block's key to its span of sorted points
+        (start * 2^24 + length).
+    block_spans: (B,) all of them; block_at: (B, 3) each block's place, in blocks.
+    reach: distance [m] up to which lists are made.
+    cell_slots: (C + COUNTERS, 2) hash table from a cell's and cone's key to their packed list
+        (start * 2^16 + length), to minus the number of visits so far, or to CROWDED.
+    pool, pool_normals: (L, 4), (L, 3) the lists end to end: rows of `points` and `normals`.
+    scratch, scratch_gap2: (B,) spans of the blocks that a search is about to look at, and their
+        squared distances in blocks.
+    made_for: (1,) the `min_cos` that facing lists are kept for; another empties the cache.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    block_slots: np.ndarray
+    block_spans: np.ndarray
+    block_at: np.ndarray
+    lattice: Lattice
     reach: float
     cell_slots: np.ndarray
     pool: np.ndarray
     pool_normals: np.ndarray
     scratch: np.ndarray
+    scratch_gap2: np.ndarray
     made_for: np.ndarray
 
 
@@ -115,11 +126,11 @@ def find_slot(slots, key, mask):
 
 
 @njit(cache=True)
-def _enter(keys, slots):
-    """Put keys (B,) with their numbers into the table."""
+def _enter(keys, values, slots):
+    """Put keys (B,) with their values (B,) into the table."""
     for number in range(keys.shape[0]):
         row = find_slot(slots, keys[number], slots.shape[0] - 1)
-        slots[row, 0], slots[row, 1] = keys[number], number
+        slots[row, 0], slots[row, 1] = keys[number], values[number]
 
 
 @njit(cache=True)
@@ -165,16 +176,21 @@ def _range(u, reach, count):
 
 
 @njit(cache=True)
-def _collect(arrays, u, v, w, reach, seen2):
-    """Write the blocks nearer than `reach`, but not than sqrt(seen2), to `scratch`; count them."""
-    slots, scratch, count, reach2 = arrays.block_slots, arrays.scratch, 0, reach * reach
-    i0, i1 = _range(u, reach, arrays.blocks_x)
-    j0, j1 = _range(v, reach, arrays.blocks_y)
-    k0, k1 = _range(w, reach, arrays.blocks_z)
+def _collect(slots, spans, block_at, lattice, scratch, gaps2, u, v, w, reach, seen2):
+    """
+    Write the blocks nearer than `reach`, but not than sqrt(seen2), to `scratch`; count them.
+
+    The nearest comes first: what is found in it rules most of the others out.
+    """
+    count, reach2 = 0, reach * reach
+    i0, i1 = _range(u, reach, lattice.blocks_x)
+    j0, j1 = _range(v, reach, lattice.blocks_y)
+    k0, k1 = _range(w, reach, lattice.blocks_z)
     if (i1 - i0) * (j1 - j0) * (k1 - k0) > scratch.shape[0]:  # fewer blocks than places for them
         for number in range(scratch.shape[0]):
-            if seen2 <= _block_gap2(arrays.block_at, number, u, v, w) < reach2:
-                scratch[count] = number
+            gap2 = _block_gap2(block_at, number, u, v, w)
+            if seen2 <= gap2 < reach2:
+                _note(scratch, gaps2, count, spans[number], gap2)
                 count += 1
         return count
     for i in range(i0, i1):
@@ -184,14 +200,31 @@ def _collect(arrays, u, v, w, reach, seen2):
             if gap_ij > reach2:
                 continue
             for k in range(k0, k1):
-                if not seen2 <= gap_ij + _gap2(w, k) < reach2:
+                gap2 = gap_ij + _gap2(w, k)
+                if not seen2 <= gap2 < reach2:
                     continue
                 key = pack(i, j, k)
                 row = find_slot(slots, key, slots.shape[0] - 1)
                 if slots[row, 0] == key:
-                    scratch[count] = slots[row, 1]
+                    _note(scratch, gaps2, count, slots[row, 1], gap2)
                     count += 1
     return count
+
+
+@njit(cache=True, inline='always')
+def _note(spans, gaps2, count, span, gap2):
+    """Add a block to those already noted, as the first if it is the nearest."""
+    if count > 0 and gap2 < gaps2[0]:
+        spans[count], gaps2[count] = spans[0], gaps2[0]
+        spans[0], gaps2[0] = span, gap2
+    else:
+        spans[count], gaps2[count] = span, gap2
+
+
+@njit(cache=True, inline='always')
+def span_bounds(span):
+    """First of a block's sorted points, and the one after its last."""
+    return span >> SPAN_BITS, (span >> SPAN_BITS) + (span & SPAN_MASK)
 
 
 @njit(cache=True, inline='always')
@@ -225,40 +258,48 @@ def _scan(points, normals, begin, end, x, y, z, dx, dy, dz, min_cos, best, best2
 
 
 @njit(cache=True)
-def _search(arrays, x, y, z, dx, dy, dz, min_cos, limit2):
+def _search(
+    points, normals, slots, spans, block_at, lattice, scratch, gaps2,
+    x, y, z, dx, dy, dz, min_cos, limit2,
+):  # fmt: skip
     """
     Find the nearest that faces the beam: (sorted point or -1, squared distance, caller's row).
 
     It is nearer than sqrt(limit2), and looked for in balls that grow until one is sure to hold it.
-    With min_cos = -1 every point counts.
+    With min_cos = -1 every point counts. The first eight are fields of `VoxelArrays`.
     """
-    scale, points, normals, start = (
-        arrays.inverse_block,
-        arrays.points,
-        arrays.normals,
-        arrays.block_start,
-    )
-    nx, ny, nz = arrays.blocks_x, arrays.blocks_y, arrays.blocks_z
-    u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
+    scale = lattice.inverse_block
+    nx, ny, nz = lattice.blocks_x, lattice.blocks_y, lattice.blocks_z
+    u, v, w = (x - lattice.x0) * scale, (y - lattice.y0) * scale, (z - lattice.z0) * scale
     best, best2, row, seen2 = -1, limit2, -1.0, 0.0
     farthest = nx + ny + nz + abs(u) + abs(v) + abs(w)
     limit = min(np.sqrt(limit2) * scale, farthest) * (1.0 + ROUNDING) + ROUNDING
     reach = min(max(-u, u - nx, -v, v - ny, -w, w - nz, 0.0) + FIRST_REACH, limit)
     while True:
         radius = limit if best < 0 else np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING
-        for c in range(_collect(arrays, u, v, w, reach, seen2)):
-            number = arrays.scratch[c]
-            if _block_gap2(arrays.block_at, number, u, v, w) > radius * radius:
+        count = _collect(slots, spans, block_at, lattice, scratch, gaps2, u, v, w, reach, seen2)
+        for c in range(count):
+            if gaps2[c] > radius * radius:
                 continue
+            first, after = span_bounds(scratch[c])
             best, best2, row = _scan(
-                points, normals, start[number], start[number + 1],
-                x, y, z, dx, dy, dz, min_cos, best, best2, row,
-            )  # fmt: skip
+                points, normals, first, after, x, y, z, dx, dy, dz, min_cos, best, best2, row
+            )
             radius = min(radius, np.sqrt(best2) * scale * (1.0 + ROUNDING) + ROUNDING)
         if radius <= reach or reach >= limit:
             return best, best2, row
         seen2 = reach * reach
         reach = radius if best >= 0 else min(2.0 * reach, limit)
+
+
+@njit(cache=True)
+def _search_arrays(arrays, x, y, z, dx, dy, dz, min_cos, limit2):
+    """`_search`, where its time does not matter."""
+    return _search(
+        arrays.points, arrays.normals, arrays.block_slots, arrays.block_spans, arrays.block_at,
+        arrays.lattice, arrays.scratch, arrays.scratch_gap2,
+        x, y, z, dx, dy, dz, min_cos, limit2,
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------ candidate lists
@@ -336,12 +377,12 @@ def _make_list(arrays, x, y, z, cone, min_cos, begin):
 
     Their number (0: no point within reach), or -1 where they are too many.
     """
-    pool, pool_normals, edge = arrays.pool, arrays.pool_normals, arrays.cell
+    pool, pool_normals, edge = arrays.pool, arrays.pool_normals, arrays.lattice.cell
     ax, ay, az = _cone_axis(cone)
     may, sure = _cone_limits(cone, min_cos)
     half_diagonal = 0.5 * np.sqrt(3.0) * edge * (1.0 + ROUNDING)
     limit = arrays.reach + half_diagonal
-    best, best2, _ = _search(arrays, x, y, z, ax, ay, az, sure, limit * limit)
+    best, best2, _ = _search_arrays(arrays, x, y, z, ax, ay, az, sure, limit * limit)
     # Every query of the cell has a point within |c - best| + half diagonal of it.
     radius = limit if best < 0 else np.sqrt(best2) + 2.0 * half_diagonal
     if best >= 0:
@@ -364,17 +405,21 @@ def _gather(arrays, x, y, z, radius, ax, ay, az, may, best, begin):
     Not those that `best` (already at row `begin`, or -1) rules out. The end of what was written,
     or -1 when they are too many.
     """
-    points, normals, scale = arrays.points, arrays.normals, arrays.inverse_block
-    pool, pool_normals, start = arrays.pool, arrays.pool_normals, arrays.block_start
-    u, v, w = (x - arrays.x0) * scale, (y - arrays.y0) * scale, (z - arrays.z0) * scale
+    points, normals, lattice = arrays.points, arrays.normals, arrays.lattice
+    pool, pool_normals, scale = arrays.pool, arrays.pool_normals, lattice.inverse_block
+    u, v, w = (x - lattice.x0) * scale, (y - lattice.y0) * scale, (z - lattice.z0) * scale
     end = begin if best < 0 else begin + 1
     reach = radius * scale * (1.0 + ROUNDING) + ROUNDING
-    for c in range(_collect(arrays, u, v, w, reach, 0.0)):
-        number = arrays.scratch[c]
-        for p in range(start[number], start[number + 1]):
+    count = _collect(
+        arrays.block_slots, arrays.block_spans, arrays.block_at, lattice,
+        arrays.scratch, arrays.scratch_gap2, u, v, w, reach, 0.0,
+    )  # fmt: skip
+    for c in range(count):
+        first, after = span_bounds(arrays.scratch[c])
+        for p in range(first, after):
             if p == best or _toward(normals, p, ax, ay, az) < may:
                 continue
-            if best >= 0 and _never_nearest(points, p, pool, begin, x, y, z, arrays.cell):
+            if best >= 0 and _never_nearest(points, p, pool, begin, x, y, z, lattice.cell):
                 continue
             if _distance2(points, p, x, y, z) > radius * radius * (1.0 + ROUNDING):
                 continue
@@ -431,13 +476,12 @@ def _prune(pool, pool_normals, begin, end, x, y, z, edge, ax, ay, az, sure):
 
 
 @njit(cache=True)
-def _visit(arrays, key, row, min_cos):
+def _visit(slots, key, row):
     """
-    Count a visit to a cell that has no list, in row `row` of the table.
+    Count a visit to a cell that has no list, where its key belongs in row `row` of the table.
 
-    From the PATIENCE-th on it gets one. Returns the cell's entry.
+    Returns the row and its entry: minus the number of visits, or CROWDED.
     """
-    slots = arrays.cell_slots
     table = slots.shape[0] - COUNTERS
     if slots[row, 0] != key:
         if slots[table, 0] * 2 >= table:
@@ -445,15 +489,9 @@ def _visit(arrays, key, row, min_cos):
             row = find_slot(slots, key, table - 1)
         slots[row, 0], slots[row, 1] = key, 0
         slots[table, 0] += 1
-    if slots[row, 1] == CROWDED:
-        return CROWDED
-    slots[row, 1] -= 1
-    if slots[row, 1] <= -PATIENCE:
-        if slots[table, 1] + GATHER_LIMIT + 2 > arrays.pool.shape[0]:
-            _empty(slots)
-            return np.int64(-1)
-        slots[row, 1] = _add_list(arrays, key, min_cos)
-    return slots[row, 1]
+    if slots[row, 1] != CROWDED:
+        slots[row, 1] -= 1
+    return row, slots[row, 1]
 
 
 @njit(cache=True)
@@ -465,27 +503,33 @@ def _empty(slots):
 
 
 @njit(cache=True)
-def _add_list(arrays, key, min_cos):
-    """Make the list of a cell and cone; its packed entry, or CROWDED."""
-    counters, place = arrays.cell_slots[-COUNTERS:], key >> 5
-    x = arrays.x0 + ((place >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * arrays.cell
-    y = arrays.y0 + (((place >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.cell
-    z = arrays.z0 + ((place & AXIS_MASK) - AXIS_LIMIT + 0.5) * arrays.cell
+def _add_list(arrays, key, row, min_cos):
+    """Give the cell and cone in row `row` of the table its list; its packed entry, or CROWDED."""
+    slots, pool, lattice, place = arrays.cell_slots, arrays.pool, arrays.lattice, key >> 5
+    counters = slots[-COUNTERS:]
+    if counters[0, 1] + GATHER_LIMIT + 2 > pool.shape[0]:
+        _empty(slots)
+        return np.int64(-1)
+    x = lattice.x0 + ((place >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * lattice.cell
+    y = lattice.y0 + (((place >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * lattice.cell
+    z = lattice.z0 + ((place & AXIS_MASK) - AXIS_LIMIT + 0.5) * lattice.cell
     begin = counters[0, 1]
     length = _make_list(arrays, x, y, z, key & 31, min_cos, begin)
     counters[1, 0] += 1
     if length < 0:
-        return np.int64(CROWDED)
-    counters[0, 1] += length
-    return (begin << 16) + length
+        slots[row, 1] = CROWDED
+    else:
+        counters[0, 1] += length
+        slots[row, 1] = (begin << 16) + length
+    return slots[row, 1]
 
 
 @njit(cache=True)
-def _list_key(x0, y0, z0, inverse_cell, x, y, z, cone):
+def _list_key(lattice, x, y, z, cone):
     """Key of the cell that holds a place, with a cone; -1 for nan and places absurdly far away."""
-    i = np.floor((x - x0) * inverse_cell)
-    j = np.floor((y - y0) * inverse_cell)
-    k = np.floor((z - z0) * inverse_cell)
+    i = np.floor((x - lattice.x0) * lattice.inverse_cell)
+    j = np.floor((y - lattice.y0) * lattice.inverse_cell)
+    k = np.floor((z - lattice.z0) * lattice.inverse_cell)
     if not (abs(i) < AXIS_LIMIT and abs(j) < AXIS_LIMIT and abs(k) < AXIS_LIMIT):
         return np.int64(-1)
     return (pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT) << 5) | cone
@@ -518,18 +562,11 @@ def _facing_listed(pool, normals, begin, end, x, y, z, dx, dy, dz, min_cos, limi
 
 @njit(cache=True)
 def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, index, distance2):
-    """
-    Find the nearest point to each query (Q, 3); where `facing`, of those that face its direction.
-
-    `arrays` is unpacked here and not per lookup, which halves the time of one that finds its list.
-    """
-    slots, pool, pool_normals, reach = (
-        arrays.cell_slots,
-        arrays.pool,
-        arrays.pool_normals,
-        arrays.reach,
-    )
-    x0, y0, z0, inverse = arrays.x0, arrays.y0, arrays.z0, arrays.inverse_cell
+    """Find the nearest point to each query (Q, 3); where `facing`, of those facing its beam."""
+    points, normals, block_slots = arrays.points, arrays.normals, arrays.block_slots
+    spans, block_at, lattice = arrays.block_spans, arrays.block_at, arrays.lattice
+    scratch, gaps2, reach = arrays.scratch, arrays.scratch_gap2, arrays.reach
+    slots, pool, pool_normals = arrays.cell_slots, arrays.pool, arrays.pool_normals
     mask, limit2 = slots.shape[0] - COUNTERS - 1, max_distance * max_distance
     dx, dy, dz, cone = 0.0, 0.0, 0.0, ANY_DIRECTION
     for q in range(queries.shape[0]):
@@ -538,13 +575,15 @@ def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, i
         if facing:
             dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
             cone = _cone(dx, dy, dz)
-        key = _list_key(x0, y0, z0, inverse, x, y, z, cone)
+        key = _list_key(lattice, x, y, z, cone)
         if key < 0:
             continue
         slot = find_slot(slots, key, mask)
         entry = slots[slot, 1]
         if slots[slot, 0] != key or entry < 0:
-            entry = _visit(arrays, key, slot, min_cos)
+            slot, entry = _visit(slots, key, slot)
+            if CROWDED < entry <= -PATIENCE:
+                entry = _add_list(arrays, key, slot, min_cos)
         best, best2 = -1, limit2
         begin, end = entry >> 16, (entry >> 16) + (entry & 0xFFFF)
         if entry >= 0 and facing:
@@ -555,7 +594,10 @@ def _nearest_batch(arrays, facing, queries, directions, max_distance, min_cos, i
             best, best2 = _nearest_listed(pool, begin, end, x, y, z, limit2)
         # A list knows all that lies within reach, and nothing about what lies beyond.
         if entry < 0 or (max_distance > reach and (best < 0 or best2 > reach * reach)):
-            best, best2, row = _search(arrays, x, y, z, dx, dy, dz, min_cos, limit2)
+            best, best2, row = _search(
+                points, normals, block_slots, spans, block_at, lattice, scratch, gaps2,
+                x, y, z, dx, dy, dz, min_cos, limit2,
+            )  # fmt: skip
         else:
             row = pool[best, 3] if best >= 0 else -1.0
         if best >= 0:
@@ -626,8 +668,8 @@ class VoxelIndex:
 
     def reserve(self) -> VoxelIndex:
         """Take the cache's memory at once, not in the course of a long run; return self."""
-        for array in (self.arrays.pool, self.arrays.pool_normals, self.arrays.scratch):
-            array.fill(0)
+        for name in ('pool', 'pool_normals', 'scratch', 'scratch_gap2'):
+            getattr(self.arrays, name).fill(0)
         return self
 
     @property
@@ -731,24 +773,19 @@ def _build(
     first = np.flatnonzero(np.diff(codes[order], prepend=-1))
     at = np.floor((points[order[first]] - origin) * (1.0 / block))
     slots = np.full((_power_of_two(4 * len(first)), 2), -1, np.int64)
-    _enter(np.array([pack(*place) for place in at.astype(np.int64).tolist()]), slots)
+    spans = (first << SPAN_BITS) + np.diff(first, append=len(points))
+    _enter(np.array([pack(*place) for place in at.astype(np.int64).tolist()]), spans, slots)
     return VoxelArrays(
         points=np.column_stack([points[order], order.astype(np.float64)]),
         normals=normals[order],
         block_slots=slots,
-        block_start=np.append(first, len(points)),
+        block_spans=spans,
         block_at=at,
-        **dict(zip(('x0', 'y0', 'z0'), map(float, origin), strict=True)),
-        block=block,
-        inverse_block=1.0 / block,
-        cell=cell,
-        inverse_cell=1.0 / cell,
-        **dict(
-            zip(
-                ('blocks_x', 'blocks_y', 'blocks_z'),
-                map(int, at.max(axis=0) + 1),
-                strict=True,
-            )
+        lattice=Lattice(
+            *map(float, origin),
+            *(block, 1.0 / block),
+            *(cell, 1.0 / cell),
+            *map(int, at.max(axis=0) + 1),
         ),
         reach=reach,
         **_empty_cache(cache_cells, len(first)),
@@ -765,6 +802,7 @@ def _empty_cache(cells: int, blocks: int) -> dict[str, np.ndarray]:
         'pool': np.empty((rows, 4)),
         'pool_normals': np.empty((rows, 3)),
         'scratch': np.empty(blocks, np.int64),
+        'scratch_gap2': np.empty(blocks),
         'made_for': np.full(1, np.nan),
     }
 

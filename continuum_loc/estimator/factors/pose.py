@@ -25,12 +25,10 @@ class _PoseFactor(Factor):
     cauchy = np.inf
 
     def stack(self, times, rows):
-        return (
-            times,
-            np.array([row[0] for row in rows]),
-            np.array([row[1] for row in rows]),
-            np.array([row[2] for row in rows]),
-        )
+        nodes = np.array([row[0] for row in rows])
+        order = np.argsort(nodes, kind='stable')  # node by node
+        arrays = (np.array([rows[m][i] for m in order]) for i in (1, 2))
+        return times[order], nodes[order], *arrays
 
     def linearise(self, batch, a, b, blocks):
         times, nodes, T_map_measured, information = batch
@@ -124,24 +122,27 @@ class InsertionFactor(_PoseFactor):
 @njit(cache=True)
 def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, T_measured, information, cauchy):
     W, V, M = lie_kernels.workspace()
+    W_own, V_own, M_own = lie_kernels.workspace()  # what `relate` left in the other one is kept
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((0, 24))
+    H_node, g_node = np.zeros((24, 24)), np.zeros(24)
     e, weighted, index = np.empty(6), np.empty(6), np.empty(24, np.int64)
     J, work, local, slope = np.empty((6, 6)), np.empty((6, 24)), np.empty((6, 6)), np.empty(6)
     size = H.shape[0] // 2
-    cost, squared = 0.0, 0.0
+    cost, squared, related = 0.0, 0.0, -1
     for m in range(times.shape[0]):
         n = nodes[m]
-        gp.hermite(
-            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work
-        )
-        lie_kernels.pose_error(T_measured[m], T, e, J, W, V, M)
+        if n != related:  # poses of a node come after one another
+            gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
+            related = n
+        gp.evaluate(T_a[n], v_a[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
+        lie_kernels.pose_error(T_measured[m], T, e, J, W_own, V_own, M_own)
         lie_kernels.apply(information[m], e, weighted)
         u2 = 0.0
         for i in range(6):
             u2 += e[i] * weighted[i]
         robust = 1.0 / (1.0 + u2 / (cauchy * cauchy))
-        lie_kernels.product(information[m], J, W[0])
+        lie_kernels.product(information[m], J, W_own[0])
         for i in range(6):
             slope[i] = 0.0
             for k in range(6):
@@ -149,9 +150,11 @@ def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, T_measured, information, ca
             for j in range(6):
                 local[i, j] = 0.0
                 for k in range(6):
-                    local[i, j] += robust * J[k, i] * W[0, k, j]
-        gp.time_index(n, VELOCITY, size, index)
-        gp.add_local(H, g, index, local, slope, J_pose, work)
+                    local[i, j] += robust * J[k, i] * W_own[0, k, j]
+        gp.gather(H_node, g_node, local, slope, J_pose, work)
+        if m + 1 == times.shape[0] or nodes[m + 1] != n:
+            gp.time_index(n, VELOCITY, size, index)
+            gp.scatter(H, g, index, H_node, g_node, 1.0)
         cost += (
             0.5 * u2
             if np.isinf(cauchy)

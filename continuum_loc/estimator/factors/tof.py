@@ -1,7 +1,7 @@
 """
 ToF: point-to-plane against the prior map (paper eqs. 1-4).
 
-Associated anew whenever its interval is linearised.
+A zone is associated anew once it has moved.
 
 All zones of one frame share (s, t), so their residuals gather in one 6x6 information block in the
 body frame, which is chained once through the interpolation. With b = R^T n the row of a zone is
@@ -29,7 +29,6 @@ from numba import njit
 import numpy as np
 
 MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
-REACH = 1.0  # [m] range at which a turn of the body moves a zone, to decide when to associate anew
 FIT_SIGMAS = 3.0  # a zone within so many sigmas of its surface counts as fitting
 HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
 
@@ -107,32 +106,29 @@ class TofFactor(Factor):
             raise MeasurementError(
                 'frozen', f"ToF sensor '{measurement.sensor}' repeats itself to the last bit"
             )
-        return number, node, q, rays, variance, Association(len(points))
+        return number, node, q, rays, variance, Matches(len(points))
 
     def stack(self, times, rows):
         """
         Stack the rows of one interval.
 
-        The association of each row becomes a view into the stacked arrays, so that it outlives the
+        The matches of each row become a view into the stacked arrays, so that they outlive the
         next stacking.
         """
         sensors = np.array([row[0] for row in rows])
         order = np.lexsort((times, sensors, [row[1] for row in rows]))  # node by node
         times, sensors, rows = times[order], sensors[order], [rows[m] for m in order]
         kept = [row[5] for row in rows]
-        hits, poses = (
-            np.array([one.hits for one in kept]),
-            np.array([one.T_map_body for one in kept]),
-        )
-        for one, hit, T in zip(kept, hits, poses, strict=True):
-            one.hits, one.T_map_body = hit, T
+        hits, places = np.array([one.hits for one in kept]), np.array([one.places for one in kept])
+        for one, hit, place in zip(kept, hits, places, strict=True):
+            one.hits, one.places = hit, place
         first = np.flatnonzero(sensors[:-1] == sensors[1:])
         pairs = np.stack([first, first + 1])  # of frames in a row of the same sensor
         arrays = (np.array([row[i] for row in rows]) for i in range(1, 5))
-        return times, sensors, *arrays, hits, poses, pairs
+        return times, sensors, *arrays, hits, places, pairs
 
     def linearise(self, batch, a, b, blocks):
-        times, sensors, nodes, q, rays, variance, hits, poses, _ = batch
+        times, sensors, nodes, q, rays, variance, hits, places, _ = batch
         options = self.settings.tof
         weights = np.array([self.weights[self._names[s]] for s in sensors])
         fits = np.zeros((len(times), 2))
@@ -158,7 +154,7 @@ class TofFactor(Factor):
             options.min_cosine,
             options.reassociate,
             hits,
-            poses,
+            places,
             fits,
         )
         by_sensor = np.zeros((len(self._names), 2))
@@ -210,18 +206,19 @@ class TofFactor(Factor):
         return {self._names[s]: counts[s] for s in np.flatnonzero(counts[:, 0])}
 
 
-class Association:
+class Matches:
     """
-    Map points that a frame's zones were matched to, and the pose at which.
+    What a frame's zones were matched to.
 
-    Its last element holds the gate, so that another gate associates anew.
+    hits: (Z,) rows of the map, -1 where there is none; places: (Z, 4) where the zone was then [m],
+    and the gate, as another gate matches anew.
     """
 
-    __slots__ = ('T_map_body', 'hits')
+    __slots__ = ('hits', 'places')
 
     def __init__(self, zones: int):
         self.hits = np.full(zones, -1, np.int64)
-        self.T_map_body = np.zeros((4, 4))
+        self.places = np.full((zones, 4), np.nan)
 
 
 @njit(cache=True)
@@ -262,17 +259,6 @@ def _beams(
 
 
 @njit(cache=True)
-def _moved(T, before, reach):
-    """Farthest that a point within `reach` of the body moved between two poses, at most [m]."""
-    shift, turn = 0.0, 0.0
-    for i in range(3):
-        shift += (T[i, 3] - before[i, 3]) ** 2
-        for j in range(3):
-            turn += (T[i, j] - before[i, j]) ** 2
-    return np.sqrt(shift) + reach * np.sqrt(0.5 * turn)
-
-
-@njit(cache=True)
 def _add(
     H,
     g,
@@ -297,7 +283,7 @@ def _add(
     min_cosine,
     reassociate,
     hits,
-    poses,
+    places,
     fits,
 ):
     W, V, M = lie_kernels.workspace()
@@ -318,10 +304,18 @@ def _add(
             gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
             related = n
         gp.evaluate(T_a[n], v_a[n], dt, times[f], T, v, J_pose, J_rate, W, V, M, J_work)
-        if poses[f, 3, 3] != gate or _moved(T, poses[f], REACH) > reassociate:
-            associate(T, q[f], rays[f], variance[f], arrays, gate, min_cosine, hits[f])
-            poses[f] = T
-            poses[f, 3, 3] = gate
+        associate(
+            T,
+            q[f],
+            rays[f],
+            variance[f],
+            arrays,
+            gate,
+            min_cosine,
+            reassociate,
+            hits[f],
+            places[f],
+        )
         frame_cost, frame_squared, frame_count = frame_information(
             T,
             q[f],
@@ -414,24 +408,38 @@ def _add_clocks(
 
 
 @njit(cache=True)
-def associate(T, q, rays, variance, arrays, gate, min_cosine, hits):
+def associate(T, q, rays, variance, arrays, gate, min_cosine, reassociate, hits, places):
     """
-    Hits (Z,): the nearest map point to each zone that faces its beam, at T_map_body.
+    Match each zone to the nearest map point that faces its beam, at T_map_body.
 
-    -1 where there is none.
+    Hits (Z,) and places (Z, 4) are those of `Matches`: a zone that moved by no more than
+    `reassociate` [m] since it was matched with this gate keeps its hit.
     """
-    zones = q.shape[0]
-    points, directions, distance2 = np.empty((zones, 3)), np.empty((zones, 3)), np.empty(zones)
+    zones, asked = q.shape[0], 0
+    points, directions = np.empty((zones, 3)), np.empty((zones, 3))
+    rows, found, distance2 = np.empty(zones, np.int64), np.empty(zones, np.int64), np.empty(zones)
     for z in range(zones):
-        nowhere = not np.isfinite(variance[z])  # a query of nan matches nothing
+        if not np.isfinite(variance[z]):
+            continue
+        moved2 = 0.0
         for i in range(3):
-            points[z, i] = (
-                np.nan
-                if nowhere
-                else (T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3])
+            points[asked, i] = T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3]
+            moved2 += (points[asked, i] - places[z, i]) ** 2
+        if places[z, 3] == gate and moved2 <= reassociate * reassociate:
+            continue
+        for i in range(3):
+            places[z, i] = points[asked, i]
+            directions[asked, i] = (
+                T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
             )
-            directions[z, i] = T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
-    nearest_facing_batch(arrays, points, directions, gate, min_cosine, hits, distance2)
+        places[z, 3] = gate
+        rows[asked] = z
+        asked += 1
+    nearest_facing_batch(
+        arrays, points[:asked], directions[:asked], gate, min_cosine, found, distance2
+    )
+    for k in range(asked):
+        hits[rows[k]] = found[k]
 
 
 @njit(cache=True)
