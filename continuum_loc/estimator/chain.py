@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 from numba import njit
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import blas, lapack
 
 BLOCK = 54  # rows of a factor that are solved at once: three nodes
@@ -140,24 +141,33 @@ class Chain:
             offsets.append(-step.factor.upper(step.y + step.Y @ offsets[-1]))
         return offsets[::-1]
 
-    def covariance(self, column: int, A: np.ndarray, B: np.ndarray | None = None) -> np.ndarray:
+    def covariance(
+        self,
+        column: int,
+        A: np.ndarray,
+        B: np.ndarray | None = None,
+        size: int | None = None,
+        step: int | None = None,
+    ) -> np.ndarray:
         """
-        Covariance (m, m) of A x + B x' of the offsets x of a column and x' of the next.
+        Covariances (G, size, size) of A x + B x' of the offsets x of a column and x' of the next.
 
-        A, B (m, D).
+        A, B (m, D). Of groups of `size` rows that begin every `step` rows; without them (m, m), of
+        all rows.
 
         With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero
         above `column`: the cost grows with the columns after it, not with the window.
         """
-        X = self._factor(column).whiten(A.T)
-        covariance = blas.dsyrk(1.0, X.T, lower=1)
+        groups = (size or len(A), step or len(A))
+        X = self._factor(column).whiten(np.ascontiguousarray(A.T))
+        covariance = _squares(X, *groups)
         for k in range(column + 1, len(self._eliminated) + 1):
             right = -(self._eliminated[k - 1].Y.T @ X)
             if B is not None and k == column + 1:
                 right += B.T
             X = self._factor(k).whiten(right)
-            covariance = blas.dsyrk(1.0, X.T, beta=1.0, c=covariance, lower=1, overwrite_c=1)
-        return _symmetrised(covariance)
+            covariance += _squares(X, *groups)
+        return covariance if size else covariance[0]
 
     def quadratic(self, C: np.ndarray) -> np.ndarray:
         """
@@ -206,7 +216,7 @@ class Chain:
         D, H, g, message = self.dim, interval.H, interval.g, self.messages[k]
         S = message.information.T + H[:D, :D]  # symmetric, and both by rows in memory like this
         factor = _factored(S.T, damping, k)
-        Y = factor.whiten(H[D:, :D].T)
+        Y = factor.whiten(H[:D, D:])
         y = factor.lower(message.gradient + g[:D])
         information = blas.dsyrk(-1.0, Y.T, beta=1.0, c=H[D:, D:].T, lower=1)
         self._eliminated.append(_Elimination(factor, Y, y))
@@ -220,6 +230,12 @@ def _factored(S: np.ndarray, damping: float, column: int) -> Cholesky:
     if info != 0 or not np.isfinite(L[-1, -1]):
         raise SingularError(column)
     return Cholesky(L)
+
+
+def _squares(X: np.ndarray, size: int, step: int) -> np.ndarray:
+    """X_i^T X_i (G, size, size) of each `size` columns X_i of X that begin every `step`."""
+    groups = sliding_window_view(X, size, axis=1)[:, ::step].transpose(1, 0, 2)
+    return groups.transpose(0, 2, 1) @ groups
 
 
 def _symmetrised(lower: np.ndarray) -> np.ndarray:

@@ -64,6 +64,7 @@ class SlidingWindowFilter:
         ]
         if self.tof is not None:
             self.factors.append(self.tof)
+        self._factors_of: dict[type, list[Factor]] = {}
         self.counts = {
             'received': Counter(),
             'used': Counter(),
@@ -177,11 +178,7 @@ class SlidingWindowFilter:
         if time < self.window.columns[0].time - TIME_EPSILON:
             self.counts['dropped']['older than the window'] += 1
             return False
-        used = [
-            self._add(factor, time, measurement)
-            for factor in self.factors
-            if isinstance(measurement, factor.consumes)
-        ]
+        used = [self._add(one, time, measurement) for one in self._consumers(type(measurement))]
         if any(used):
             self.counts['used'][type(measurement).__name__] += 1
             self.newest = max(self.newest, measurement.stamp)
@@ -189,6 +186,14 @@ class SlidingWindowFilter:
             self._rest.note(measurement)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
         return any(used)
+
+    def _consumers(self, kind: type) -> list[Factor]:
+        """Return the factors that a kind of measurement is for."""
+        if kind not in self._factors_of:
+            self._factors_of[kind] = [
+                factor for factor in self.factors if issubclass(kind, factor.consumes)
+            ]
+        return self._factors_of[kind]
 
     def _add(self, factor: Factor, time: float, measurement: Measurement) -> bool:
         try:

@@ -71,7 +71,8 @@ def evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
     """
     `hermite` between two states that `relate` left in the workspace: any number of times.
 
-    A Jacobian that has no rows is left out.
+    J_rate may be that of the last r components alone (r, 24), and a Jacobian without rows is left
+    out.
     """
     rate_at(v_a, d, tau, v, W, V)
     by_gamma, by_rate, h = J_work[0], J_work[1], V[13]
@@ -88,14 +89,15 @@ def evaluate(T_a, v_a, d, tau, T, v, J_pose, J_rate, W, V, M, J_work):
     if J_rate.shape[0] > 0:
         _chain_rate(h[3], h[4], h[5], W, by_rate)
         J_rate[:, :] = 0.0
-        _add_product(W[7], by_gamma, J_rate)
-        _add_product(W[8], by_rate, J_rate)
+        first = 6 - J_rate.shape[0]
+        _add_product(W[7, first:], by_gamma, J_rate)
+        _add_product(W[8, first:], by_rate, J_rate)
 
 
 @njit(cache=True)
 def _add_product(A, B, out):
-    """Add A (6, 6) B (6, 24) to out."""
-    for i in range(6):
+    """Add A (r, 6) B (6, 24) to out."""
+    for i in range(A.shape[0]):
         for k in range(6):  # the innermost loop is over neighbours in memory
             scale = A[i, k]
             for j in range(24):
@@ -283,6 +285,8 @@ def gather_rows(H_sum, g_sum, e, J):
     for i in range(e.shape[0]):
         for j in range(J.shape[1]):
             slope = J[i, j]
+            if slope == 0.0:  # as rotation is by all translation
+                continue
             g_sum[j] += slope * e[i]
             for k in range(J.shape[1]):
                 H_sum[j, k] += slope * J[i, k]

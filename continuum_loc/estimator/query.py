@@ -52,13 +52,9 @@ class History:
         column = window.column(k)
         if self._columns and column.time < self._columns[-1].column.time + TIME_EPSILON:
             return
-        P = window.chain.covariance(k, np.eye(NODE_DIM * window.grid.nodes, window.grid.dim))
-        pairs = [slice(NODE_DIM * n, NODE_DIM * (n + 2)) for n in range(window.grid.nodes - 1)]
-        self._columns.append(
-            PastColumn(
-                column, np.array([P[pair, pair] for pair in pairs]), window.intervals[k].jerked
-            )
-        )
+        nodes = np.eye(NODE_DIM * window.grid.nodes, window.grid.dim)
+        P = window.chain.covariance(k, nodes, size=2 * NODE_DIM, step=NODE_DIM)
+        self._columns.append(PastColumn(column, P, window.intervals[k].jerked))
         while self._columns[0].column.time < column.time - self._duration:
             self._columns.popleft()
 

@@ -366,9 +366,9 @@ class Window:
 
     def motion_covariance(self, time: float, nodes: np.ndarray) -> np.ndarray:
         """Covariance (m, 12, 12) of [pose, velocity] of `nodes` (m,) at `time` in the window."""
-        k, m = self.knot_before(time), len(nodes)
+        k = self.knot_before(time)
         a, b = self.column(k), self.column(k + 1)
-        P = self.chain.covariance(k, *motion_jacobians(a, b, time, nodes, self.grid.dim))
-        own = P.reshape(m, 12, m, 12)[np.arange(m), :, np.arange(m)]
+        A, B = motion_jacobians(a, b, time, nodes, self.grid.dim)
+        own = self.chain.covariance(k, A, B, size=12, step=12)
         velocity_psd = self.intervals[k].jerked[:, None] * self.priors.velocity_psd
         return own + motion_bridge(a, b, time, velocity_psd[nodes])

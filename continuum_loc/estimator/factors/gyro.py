@@ -48,8 +48,8 @@ class GyroFactor(Factor):
 
     def row(self, measurement: ImuSample) -> tuple:
         number, node, R_ring_imu = known_sensor(self._imus, measurement.sensor, 'IMU')
-        require_finite(measurement.angular_velocity, 'angular velocity', measurement.sensor)
-        if np.abs(measurement.angular_velocity).max() > self.robot.imu_model.gyro_range:
+        if not np.abs(measurement.angular_velocity).max() <= self.robot.imu_model.gyro_range:
+            require_finite(measurement.angular_velocity, 'angular velocity', measurement.sensor)
             raise MeasurementError(
                 'saturated',
                 f"gyro '{measurement.sensor}' beyond its full scale of "
@@ -169,7 +169,7 @@ def _add(
     """
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((3, 24))
     J, index = np.zeros((3, 27)), np.empty(27, np.int64)
     H_imu, g_imu = np.zeros((27, 27)), np.zeros(27)
     size, c2 = H.shape[0] // 2, cauchy * cauchy
@@ -187,7 +187,7 @@ def _add(
             residuals[m, i] = v[3 + i] + bias[imu, i] - omega[m, i]
             misfit += weight * residuals[m, i] * residuals[m, i]
             for j in range(24):
-                J[i, j] = J_rate[3 + i, j]
+                J[i, j] = J_rate[i, j]
         gp.gather_rows(H_imu, g_imu, residuals[m], J)
         samples += 1
         if m + 1 < times.shape[0] and imus[m + 1] == imu:
@@ -225,7 +225,7 @@ def _add_clocks(
     """Add each sample's slope, information and coupling; the slope is the angular acceleration."""
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((6, 24))
+    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((3, 24))
     before, after, index = np.empty(6), np.empty(6), np.empty(24, np.int64)
     related = -1
     for m in range(times.shape[0]):
@@ -246,7 +246,7 @@ def _add_clocks(
             information[imu] += slope * slope
             coupling[bias_offset + 3 * imu + i - 3, imu] += slope
             for j in range(24):
-                coupling[index[j], imu] += slope * J_rate[i, j]
+                coupling[index[j], imu] += slope * J_rate[i - 3, j]
 
 
 @njit(cache=True)

@@ -110,13 +110,11 @@ class InsertionFactor(_PoseFactor):
             )
         travel = float(measurement.position[measurement.names.index('insertion')])
         require_finite(np.array(travel), 'insertion', 'joint_states')
+        T_map_measured = self.robot.base.T_map_base.copy()
+        T_map_measured[:3, 3] += travel * T_map_measured[:3, 0]
         information = np.zeros((6, 6))
         information[0, 0] = insertion.sigma**-2.0
-        return (
-            0,
-            self.robot.base.T_map_base @ lie.exp(np.array([travel, 0, 0, 0, 0, 0])),
-            information,
-        )
+        return 0, T_map_measured, information
 
 
 @njit(cache=True)

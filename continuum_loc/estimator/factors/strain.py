@@ -121,7 +121,7 @@ def _add(
 ):
     W, V, M = lie_kernels.workspace()
     J_work = np.empty((2, 6, 24))
-    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((6, 24))
+    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((2, 24))
     stations = segments.shape[0]
     local = np.zeros((stations, 4, 4))  # information of [bending at a; bending at b]
     slope = np.zeros((stations, 4))
@@ -139,7 +139,7 @@ def _add(
             for i in range(2):
                 values[m, 2 * half + i] = rate[4 + i]
                 for j in range(24):
-                    jacobians[m, 2 * half + i, 24 * half + j] = J_rate[4 + i, j]
+                    jacobians[m, 2 * half + i, 24 * half + j] = J_rate[i, j]
     cost, squared = 0.0, 0.0
     c2 = cauchy * cauchy
     for r in range(times.shape[0]):
