@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.chain import Blocks, Chain, Message
+from continuum_loc.estimator.chain import Blocks, Chain, Message, symmetric
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.estimator.state import NODE_DIM
 from continuum_loc.evaluation.bench import one_core, seconds_of, side_by_side
@@ -111,11 +111,11 @@ class _Gtsam:
         self._graph = gtsam.GaussianFactorGraph()
         self._columns = len(blocks) + 1
         pieces = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-        self._add(start.information, start.gradient, 0, pieces)
+        self._add(symmetric(start.information), start.gradient, 0, pieces)
         for k, block in enumerate(blocks):
             dim = bounds[-1]
             both = pieces + [slice(piece.start + dim, piece.stop + dim) for piece in pieces]
-            self._add(block.H, block.g, k * self._per_column, both)
+            self._add(symmetric(block.H), block.g, k * self._per_column, both)
         self._order = gtsam.Ordering()
         for key in range(self._columns * self._per_column):
             self._order.push_back(key)

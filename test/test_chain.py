@@ -4,7 +4,16 @@ Test the chain against dense algebra.
 Solution, covariances, and marginalisation equal to the batch.
 """
 
-from continuum_loc.estimator.chain import BLOCK, Blocks, Chain, Cholesky, Message, SingularError
+from continuum_loc.estimator.chain import (
+    BLOCK,
+    Blocks,
+    Chain,
+    Cholesky,
+    half_square,
+    Message,
+    SingularError,
+    symmetric,
+)
 import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
@@ -17,19 +26,19 @@ def random_chain(seed: int):
     intervals = []
     for _ in range(K - 1):
         A = rng.normal(size=(4 * D, 2 * D))
-        intervals.append(Blocks(A.T @ A, rng.normal(size=2 * D)))
+        intervals.append(Blocks(np.triu(A.T @ A), rng.normal(size=2 * D)))
     A = rng.normal(size=(2 * D, D))
-    return Message(A.T @ A, rng.normal(size=D)), intervals
+    return Message(np.triu(A.T @ A), rng.normal(size=D)), intervals
 
 
 def dense(start, intervals):
     size = D * (len(intervals) + 1)
     H, g = np.zeros((size, size)), np.zeros(size)
-    H[:D, :D] += start.information
+    H[:D, :D] += symmetric(start.information)
     g[:D] += start.gradient
     for k, block in enumerate(intervals):
         at = slice(D * k, D * (k + 2))
-        H[at, at] += block.H
+        H[at, at] += symmetric(block.H)
         g[at] += block.g
     return H, g
 
@@ -83,6 +92,12 @@ def test_marginalising_equals_the_batch_solution():
     np.testing.assert_allclose(offsets[-1], batch[-D:], atol=1e-9)
 
 
+def test_half_a_square_is_that_of_the_whole_matrix():
+    rng = np.random.default_rng(9)
+    A, x = rng.normal(size=(2 * D, D)), rng.normal(size=D)
+    assert half_square(np.triu(A.T @ A), x) == pytest.approx(0.5 * x @ A.T @ A @ x)
+
+
 def test_kept_messages_change_nothing():
     start, intervals = random_chain(3)
     chain = Chain(D, start)
@@ -109,3 +124,40 @@ def test_quadratic_form_of_the_inverse_equals_dense_algebra():
     flat = C.reshape(K * D, 3)
     expected = flat.T @ np.linalg.solve(dense(start, intervals)[0], flat)
     np.testing.assert_allclose(chain.quadratic(C), expected, rtol=1e-9)
+
+
+def coupled_by_neighbours(size: int) -> np.ndarray:
+    """Right-hand sides as a column's neighbours give them: zero down to a step that goes down."""
+    rng = np.random.default_rng(size)
+    B = rng.normal(size=(size, size))
+    return np.where(np.arange(size)[:, None] >= np.arange(size) - 20, B, 0.0)
+
+
+@pytest.mark.parametrize('size', [BLOCK + 1, 4 * BLOCK - 3])
+def test_zeros_above_a_right_hand_side_are_left_out_and_stay_zeros(size):
+    rng = np.random.default_rng(size)
+    L = np.linalg.cholesky(np.eye(size) + np.cov(rng.normal(size=(size, 3 * size))))
+    B = coupled_by_neighbours(size)
+    for right in (B, B[:, ::-1].copy(), B * (np.arange(size) % 3 > 0)):
+        X = Cholesky(np.asfortranarray(L)).whiten(right)
+        np.testing.assert_allclose(X, solve_triangular(L, right, lower=True), atol=1e-12)
+        above = np.maximum.accumulate(right != 0.0, axis=0)
+        blocks = np.repeat(np.arange(-(-size // BLOCK)), BLOCK)[:size]
+        for k in range(1, blocks[-1] + 1):
+            reached = above[blocks <= k].any(axis=0)
+            assert not X[blocks < k][:, ~above[blocks < k].any(axis=0) & reached].any()
+
+
+def test_covariances_of_groups_are_those_of_all_together():
+    start, intervals = random_chain(8)
+    chain = Chain(D, start)
+    chain.solve(intervals, 0)
+    A, B = np.random.default_rng(8).normal(size=(2, 6, D))
+    whole = chain.covariance(1, A, B)
+    apart = chain.covariance(1, A, B, size=2, step=2)
+    sliding = chain.covariance(1, A, B, size=4, step=2)
+    for groups, size in ((apart, 2), (sliding, 4)):
+        for i, found in enumerate(groups):
+            at = slice(2 * i, 2 * i + size)
+            np.testing.assert_allclose(found, whole[at, at], atol=1e-12)
+    assert len(apart) == 3 and len(sliding) == 2

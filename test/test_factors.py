@@ -6,7 +6,7 @@ Over random states.
 
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings
-from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.chain import Blocks, symmetric
 from continuum_loc.estimator.factors import FACTORS, MeasurementError, TofFactor
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import column_at_rest, Grid
@@ -139,15 +139,15 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
 @pytest.mark.parametrize(
     'kind', ['gyro', 'strain', 'tof', 'tracker', 'insertion', 'gravity', 'field']
 )
-def test_hessian_is_symmetric_and_positive_semidefinite(kind):
+def test_hessian_is_an_upper_triangle_and_positive_semidefinite(kind):
     description = robot()
     grid = Grid(description, 0.16)
     factor = make_factor(kind, description, grid)
     rows = [factor.row(m) for m in measurements(kind, description)]
     blocks = Blocks.zeros(grid.dim)
     factor.linearise(factor.stack(np.full(len(rows), 0.5 * DT), rows), *columns(grid, 3), blocks)
-    np.testing.assert_allclose(blocks.H, blocks.H.T, atol=1e-9 * np.abs(blocks.H).max())
-    assert np.linalg.eigvalsh(blocks.H)[0] > -1e-9 * np.abs(blocks.H).max()
+    assert blocks.H.any() and not np.tril(blocks.H, -1).any()
+    assert np.linalg.eigvalsh(symmetric(blocks.H))[0] > -1e-9 * np.abs(blocks.H).max()
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -171,7 +171,7 @@ def test_prior_gradient(seed):
             one[bias:] = 0.0  # the bias walk reports no cost
         slope = (blocks_at(step * x).cost - blocks_at(-step * x).cost) / (2.0 * step)
         assert slope == pytest.approx(centre.g @ x, rel=1e-6)
-    np.testing.assert_allclose(centre.H, centre.H.T, atol=1e-12 * np.abs(centre.H).max())
+    assert centre.H.any() and not np.tril(centre.H, -1).any()
 
 
 def test_strain_matches_the_papers_map():
@@ -254,7 +254,7 @@ def gyro_at_rest(rates: np.ndarray, cauchy: float):
     batch = factor.stack(np.linspace(0.1, 0.9, len(rates)) * DT, rows)
     report = factor.linearise(batch, a, a.predict(DT), blocks)
     at = slice(grid.bias_offset, grid.bias_offset + 3)
-    return report.cost, blocks.g[at], blocks.H[at, at]
+    return report.cost, blocks.g[at], symmetric(blocks.H)[at, at]
 
 
 def test_the_loss_of_a_gyro_is_the_integral_of_its_slope():

@@ -43,7 +43,7 @@ class Blocks:
     """
     Normal equations of one interval, at its linearisation point.
 
-    H (2 D, 2 D) symmetric, g (2 D,), and the cost.
+    H (2 D, 2 D), of which the upper triangle is kept and the rest is zero, g (2 D,), and the cost.
     """
 
     H: np.ndarray
@@ -62,7 +62,11 @@ class Blocks:
 
 @dataclass(slots=True, eq=False)
 class Message:
-    """What the past says of a column: information (D, D) and gradient (D,), where linearised."""
+    """
+    What the past says of a column: information (D, D) and gradient (D,), where linearised.
+
+    Of the information, as of `Blocks`, the upper triangle.
+    """
 
     information: np.ndarray
     gradient: np.ndarray
@@ -214,19 +218,19 @@ class Chain:
 
     def _eliminate(self, interval: Blocks, k: int, damping: float) -> None:
         D, H, g, message = self.dim, interval.H, interval.g, self.messages[k]
-        S = message.information.T + H[:D, :D]  # symmetric, and both by rows in memory like this
-        factor = _factored(S.T, damping, k)
+        factor = _factored(message.information + H[:D, :D], damping, k)
         Y = factor.whiten(H[:D, D:])
         y = factor.lower(message.gradient + g[:D])
-        information = blas.dsyrk(-1.0, Y.T, beta=1.0, c=H[D:, D:].T, lower=1)
+        information = blas.dsyrk(-1.0, Y.T, beta=1.0, c=H[D:, D:].T, lower=1).T
         self._eliminated.append(_Elimination(factor, Y, y))
-        self.messages.append(Message(_symmetrised(information), g[D:] - Y.T @ y))
+        self.messages.append(Message(information, g[D:] - Y.T @ y))
 
 
 def _factored(S: np.ndarray, damping: float, column: int) -> Cholesky:
+    """Factor a matrix given by its upper triangle."""
     if damping > 0.0:
         S = S + damping * np.diag(np.diag(S))
-    L, info = lapack.dpotrf(S, lower=1, clean=1)
+    L, info = lapack.dpotrf(S.T, lower=1, clean=1)  # by columns, as LAPACK has it
     if info != 0 or not np.isfinite(L[-1, -1]):
         raise SingularError(column)
     return Cholesky(L)
@@ -238,10 +242,14 @@ def _squares(X: np.ndarray, size: int, step: int) -> np.ndarray:
     return groups.transpose(0, 2, 1) @ groups
 
 
-def _symmetrised(lower: np.ndarray) -> np.ndarray:
-    """Full symmetric matrix of one whose lower triangle alone was updated."""
-    _mirror(lower)
-    return lower
+def symmetric(H: np.ndarray) -> np.ndarray:
+    """Whole of a symmetric matrix whose upper triangle H (n, n) is."""
+    return H + np.triu(H, 1).T
+
+
+def half_square(H: np.ndarray, x: np.ndarray) -> float:
+    """x^T H x / 2 of a symmetric matrix whose upper triangle H (n, n) is."""
+    return float(x @ (H @ x) - 0.5 * (np.diagonal(H) @ np.square(x)))
 
 
 @njit(cache=True)
@@ -257,11 +265,3 @@ def _reaches(B, rows):
             reach = last
         reaches[k] = reach
     return reaches
-
-
-@njit(cache=True)
-def _mirror(matrix):
-    """Copy the lower triangle onto the upper one, in place."""
-    for j in range(matrix.shape[1]):
-        for i in range(j):
-            matrix[i, j] = matrix[j, i]

@@ -224,6 +224,8 @@ def add_motion(H, g, index, e, J, d, q_inverse):
     """
     Add the prior's normal equations to H, g at the 24 rows `index`; returns the squared error.
 
+    Like all that adds to H it adds to the upper triangle, so that `index` has to increase.
+
     The information is Q(d)^-1 (x) diag(q)^-1 with Q(d)^-1 = [[12/d^3, -6/d^2], [-6/d^2, 4/d]].
     """
     a, b, c = 12.0 / d**3, -6.0 / d**2, 4.0 / d
@@ -238,7 +240,7 @@ def add_motion(H, g, index, e, J, d, q_inverse):
                 continue
             row = index[j]
             g[row] += upper[j] * eu + lower[j] * el
-            for k in range(24):
+            for k in range(j, 24):
                 H[row, index[k]] += wu * upper[k] + wl * lower[k]
     return squared
 
@@ -255,7 +257,7 @@ def add_rows(H, g, index, e, J, weights):
             if scaled == 0.0:
                 continue
             g[index[j]] += scaled * e[i]
-            for k in range(index.shape[0]):
+            for k in range(j, index.shape[0]):
                 H[index[j], index[k]] += scaled * J[i, k]
     return squared
 
@@ -264,6 +266,8 @@ def add_rows(H, g, index, e, J, weights):
 def gather(H_sum, g_sum, H_local, g_local, J, work):
     """
     Add a local information block (m, m), (m,), chained through J (m, n), to H_sum (n, n), g_sum.
+
+    Of H_sum only the upper triangle.
 
     For many measurements of the same states, before one `scatter`.
     """
@@ -275,7 +279,7 @@ def gather(H_sum, g_sum, H_local, g_local, J, work):
             if slope == 0.0:
                 continue
             g_sum[j] += slope * g_local[i]
-            for k in range(n):
+            for k in range(j, n):
                 H_sum[j, k] += slope * work[i, k]
 
 
@@ -288,7 +292,7 @@ def gather_rows(H_sum, g_sum, e, J):
             if slope == 0.0:  # as rotation is by all translation
                 continue
             g_sum[j] += slope * e[i]
-            for k in range(J.shape[1]):
+            for k in range(j, J.shape[1]):
                 H_sum[j, k] += slope * J[i, k]
 
 
@@ -299,7 +303,7 @@ def scatter(H, g, index, H_sum, g_sum, weight):
     for j in range(n):
         g[index[j]] += weight * g_sum[j]
         g_sum[j] = 0.0
-        for k in range(n):
+        for k in range(j, n):
             H[index[j], index[k]] += weight * H_sum[j, k]
             H_sum[j, k] = 0.0
 

@@ -6,7 +6,7 @@ Its measurements, and their normal equations at the current linearisation.
 
 from __future__ import annotations
 
-from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator.chain import Blocks, half_square
 from continuum_loc.estimator.factors import ClockScores, Factor, FactorReport
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Column
@@ -60,4 +60,4 @@ class Interval:
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
         """Cost that the quadratic model gives at offsets from the linearisation point."""
         x = np.concatenate([offset_a, offset_b])
-        return self.blocks.cost + float(x @ (self.blocks.g + 0.5 * (self.blocks.H @ x)))
+        return self.blocks.cost + float(self.blocks.g @ x) + half_square(self.blocks.H, x)

@@ -193,7 +193,6 @@ def _add_time(
             H[older, older] += weight
             H[newer, newer] += weight
             H[older, newer] -= weight
-            H[newer, older] -= weight
             g[older] -= weight * walk[i]
             g[newer] += weight * walk[i]
     return cost
@@ -239,7 +238,7 @@ def _add_base(H, g, T, velocity, T_map_base, information, rate_information):
         for j in range(6):
             weighted = information[i] * J[i, j]
             g[j] += weighted * e[i]
-            for k in range(6):
+            for k in range(j, 6):
                 H[j, k] += weighted * J[i, k]
         H[VELOCITY + i, VELOCITY + i] += rate_information[i]
         g[VELOCITY + i] += rate_information[i] * velocity[i]
@@ -257,7 +256,6 @@ def _add_bias(H, g, bias_a, bias_b, weight, bias_offset):
             H[older, older] += weight
             H[newer, newer] += weight
             H[older, newer] -= weight
-            H[newer, older] -= weight
             g[older] -= step
             g[newer] += step
 

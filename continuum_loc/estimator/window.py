@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil
 
-from continuum_loc.estimator.chain import Chain, Message, SingularError
+from continuum_loc.estimator.chain import Chain, half_square, Message, SingularError
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.output import (
@@ -288,7 +288,7 @@ class Window:
     def _cost(self) -> float:
         """Robust cost where linearised, and by the quadratic model at the offsets."""
         start, x = self.chain.messages[0], self.offsets[0]
-        total = float(x @ (start.gradient + 0.5 * (start.information @ x)))
+        total = float(start.gradient @ x) + half_square(start.information, x)
         return total + sum(
             interval.modelled_cost(self.offsets[k], self.offsets[k + 1])
             for k, interval in enumerate(self.intervals)

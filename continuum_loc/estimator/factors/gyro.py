@@ -176,7 +176,7 @@ def _add(
     cost, squared, related = 0.0, 0.0, -1
     misfit, samples = 0.0, 0
     for i in range(3):
-        J[i, 24 + i] = 1.0
+        J[i, 12 + i] = 1.0  # of the bias, which stands between the two columns' parts
     for m in range(times.shape[0]):
         n, imu = nodes[m], imus[m]
         if n != related:  # samples of an IMU come after one another
@@ -186,8 +186,8 @@ def _add(
         for i in range(3):
             residuals[m, i] = v[3 + i] + bias[imu, i] - omega[m, i]
             misfit += weight * residuals[m, i] * residuals[m, i]
-            for j in range(24):
-                J[i, j] = J_rate[i, j]
+            for j in range(12):
+                J[i, j], J[i, 15 + j] = J_rate[i, j], J_rate[i, 12 + j]
         gp.gather_rows(H_imu, g_imu, residuals[m], J)
         samples += 1
         if m + 1 < times.shape[0] and imus[m + 1] == imu:
@@ -197,8 +197,9 @@ def _add(
         cost += 0.5 * shares[imu] * 3.0 * samples * c2 * np.log1p(spread / c2)
         squared += misfit * robust
         gp.time_index(n, VELOCITY, size, index)
+        index[15:] = index[12:24].copy()
         for i in range(3):
-            index[24 + i] = bias_offset + 3 * imu + i
+            index[12 + i] = bias_offset + 3 * imu + i
         gp.scatter(H, g, index, H_imu, g_imu, shares[imu] * weight * robust)
         misfit, samples = 0.0, 0
     return cost, squared
