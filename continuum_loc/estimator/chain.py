@@ -25,6 +25,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import blas, lapack
 
 BLOCK = 54  # rows of a factor that are solved at once: three nodes
+Step = tuple[int, slice]
 
 
 class SingularError(ArithmeticError):
@@ -55,7 +56,9 @@ class Blocks:
         return cls(np.zeros((2 * dim, 2 * dim)), np.zeros(2 * dim))
 
     def clear(self) -> None:
-        self.H.fill(0.0)
+        dim = len(self.g) // 2
+        self.H[:dim].fill(0.0)
+        self.H[dim:, dim:].fill(0.0)  # below the diagonal nothing was added
         self.g.fill(0.0)
         self.cost = 0.0
 
@@ -90,21 +93,19 @@ class Cholesky:
         self.L = L
         self._inverses: list[np.ndarray] | None = None
 
-    def whiten(self, B: np.ndarray) -> np.ndarray:
-        """L^-1 B (D, m)."""
+    def whiten(self, B: np.ndarray, steps: list[Step] | None = None) -> np.ndarray:
+        """L^-1 B (D, m), with B's `steps_of` where they are known."""
         starts = range(0, len(self.L), BLOCK)
         rows = [slice(at, at + BLOCK) for at in starts]
         if self._inverses is None:
             self._inverses = [lapack.dtrtri(self.L[block, block], lower=1)[0] for block in rows]
-        X, done = np.zeros(B.shape), 0
-        for first, reach in enumerate(_reaches(B, BLOCK)):
-            new = slice(done, reach)  # the right-hand sides that begin in this block
-            for k in range(first, len(rows)) if reach > done else ():
-                rest, above = B[rows[k], new], slice(starts[first], starts[k])
-                if k > first:
-                    rest = rest - self.L[rows[k], above] @ X[above, new]
-                np.matmul(self._inverses[k], rest, out=X[rows[k], new])
-            done = max(done, reach)
+        X = np.zeros(B.shape)
+        for top, columns in steps_of(B) if steps is None else steps:
+            for k in range(top // BLOCK, len(rows)):
+                rest, above = B[rows[k], columns], slice(top, starts[k])
+                if starts[k] > top:
+                    rest = rest - self.L[rows[k], above] @ X[above, columns]
+                np.matmul(self._inverses[k], rest, out=X[rows[k], columns])
         return X
 
     def lower(self, b: np.ndarray) -> np.ndarray:
@@ -118,11 +119,19 @@ class Cholesky:
 
 @dataclass(slots=True, eq=False)
 class _Elimination:
-    """One eliminated column: the factor of S, Y = L^-1 H_ab, y = L^-1 (eta + g_a)."""
+    """One eliminated column: S's factor, Y = L^-1 H_ab with its steps, y = L^-1 (eta + g_a)."""
 
     factor: Cholesky
     Y: np.ndarray
     y: np.ndarray
+    steps: list[Step]
+
+    def passed_on(self, X: np.ndarray) -> np.ndarray:
+        """Y^T X (D, m): what right-hand sides become at the next column, but for the sign."""
+        out = np.zeros((self.Y.shape[1], X.shape[1]))
+        for top, columns in self.steps:
+            np.matmul(self.Y[top:, columns].T, X[top:], out=out[columns])
+        return out
 
 
 class Chain:
@@ -166,7 +175,7 @@ class Chain:
         X = self._factor(column).whiten(np.ascontiguousarray(A.T))
         covariance = _squares(X, *groups)
         for k in range(column + 1, len(self._eliminated) + 1):
-            right = -(self._eliminated[k - 1].Y.T @ X)
+            right = -self._eliminated[k - 1].passed_on(X)
             if B is not None and k == column + 1:
                 right += B.T
             X = self._factor(k).whiten(right)
@@ -184,7 +193,7 @@ class Chain:
             y = self._factor(k).whiten(right)
             total += y.T @ y
             if k + 1 < len(C):
-                right = C[k + 1] - self._eliminated[k].Y.T @ y
+                right = C[k + 1] - self._eliminated[k].passed_on(y)
         return total
 
     def _factor(self, column: int) -> Cholesky:
@@ -219,10 +228,11 @@ class Chain:
     def _eliminate(self, interval: Blocks, k: int, damping: float) -> None:
         D, H, g, message = self.dim, interval.H, interval.g, self.messages[k]
         factor = _factored(message.information + H[:D, :D], damping, k)
-        Y = factor.whiten(H[:D, D:])
+        steps = steps_of(H[:D, D:])
+        Y = factor.whiten(H[:D, D:], steps)
         y = factor.lower(message.gradient + g[:D])
         information = blas.dsyrk(-1.0, Y.T, beta=1.0, c=H[D:, D:].T, lower=1).T
-        self._eliminated.append(_Elimination(factor, Y, y))
+        self._eliminated.append(_Elimination(factor, Y, y, steps))
         self.messages.append(Message(information, g[D:] - Y.T @ y))
 
 
@@ -238,8 +248,11 @@ def _factored(S: np.ndarray, damping: float, column: int) -> Cholesky:
 
 def _squares(X: np.ndarray, size: int, step: int) -> np.ndarray:
     """X_i^T X_i (G, size, size) of each `size` columns X_i of X that begin every `step`."""
-    groups = sliding_window_view(X, size, axis=1)[:, ::step].transpose(1, 0, 2)
-    return groups.transpose(0, 2, 1) @ groups
+    apart = size == step and X.shape[1] % size == 0  # and so without numpy's slow windows
+    groups = (
+        X.reshape(len(X), -1, size) if apart else sliding_window_view(X, size, axis=1)[:, ::step]
+    )
+    return groups.transpose(1, 2, 0) @ groups.transpose(1, 0, 2)
 
 
 def symmetric(H: np.ndarray) -> np.ndarray:
@@ -250,6 +263,20 @@ def symmetric(H: np.ndarray) -> np.ndarray:
 def half_square(H: np.ndarray, x: np.ndarray) -> float:
     """x^T H x / 2 of a symmetric matrix whose upper triangle H (n, n) is."""
     return float(x @ (H @ x) - 0.5 * (np.diagonal(H) @ np.square(x)))
+
+
+def steps_of(B: np.ndarray) -> list[Step]:
+    """
+    Where the columns of B (D, m) begin: (first row of a block, columns zero in all rows above).
+
+    Columns that begin later than one to their right count as beginning with that one.
+    """
+    reaches = [0, *_reaches(B, BLOCK).tolist()]
+    return [
+        (BLOCK * k, slice(a, b))
+        for k, (a, b) in enumerate(zip(reaches[:-1], reaches[1:], strict=True))
+        if b > a
+    ]
 
 
 @njit(cache=True)

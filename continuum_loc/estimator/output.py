@@ -155,15 +155,25 @@ def rattle_covariance(s_imu: np.ndarray, turns: np.ndarray, s: np.ndarray) -> np
     The clamped base does not rattle, and turns move what is beyond them sideways: the lateral
     deviations are the turns' integrals along the body, as for one mode of bending.
     """
-    at = np.append(0.0, s_imu)
-    turn = np.vstack([np.zeros(3), turns])
-    shift = np.zeros(turn.shape)
-    np.cumsum(np.diff(at)[:, None] * 0.5 * (turn[1:] + turn[:-1]), axis=0, out=shift[1:])
-    deviation = np.zeros((len(s), 6))
+    covariance = np.zeros((len(s), 6, 6))
+    _rattle(s_imu, turns, s, covariance)
+    return covariance
+
+
+@njit(cache=True)
+def _rattle(s_imu, turns, s, covariance):
+    at, turn, shift = (
+        np.zeros(len(s_imu) + 1),
+        np.zeros((3, len(s_imu) + 1)),
+        np.zeros((3, len(s_imu) + 1)),
+    )
+    at[1:], turn[:, 1:] = s_imu, turns.T
+    for m in range(1, len(at)):
+        shift[:, m] = shift[:, m - 1] + 0.5 * (at[m] - at[m - 1]) * (turn[:, m] + turn[:, m - 1])
     for i in range(3):
-        deviation[:, 3 + i] = np.interp(s, at, turn[:, i])
-    deviation[:, 1], deviation[:, 2] = np.interp(s, at, shift[:, 2]), np.interp(s, at, shift[:, 1])
-    return np.square(deviation)[:, :, None] * np.eye(6)
+        covariance[:, 3 + i, 3 + i] = np.square(np.interp(s, at, turn[i]))
+    covariance[:, 1, 1] = np.square(np.interp(s, at, shift[2]))
+    covariance[:, 2, 2] = np.square(np.interp(s, at, shift[1]))
 
 
 @njit(cache=True)
@@ -174,7 +184,8 @@ def _interpolate(T_a, v_a, T_b, v_b, d, tau, from_a, from_b, T, v, J_pose, J_rat
     The Jacobians are written where J_pose has room.
     """
     W, V, M = lie_kernels.workspace()
-    J_work, pose, rate = np.empty((2, 6, 24)), np.empty((6, 24)), np.empty((6, 24))
+    rows = 6 if J_pose.shape[0] > 0 else 0
+    J_work, pose, rate = np.empty((2, 6, 24)), np.empty((rows, 24)), np.empty((rows, 24))
     for m in range(tau.shape[0]):
         a, b = from_a[m], from_b[m]
         gp.hermite(
