@@ -153,13 +153,15 @@ class Recovery:
         Solve the window from a guess: (iterations, whether it converged).
 
         The loss is tighter than when tracking: a wrong body must not pay for few far zones by many
-        near ones.
+        near ones. Every zone is matched anew at each iteration, as a body that comes from afar may
+        otherwise halt where its next step moves none of them far enough.
         """
         if self._tof is None:
             return self._window.acquire(lambda iteration: True)
-        self._tof.cauchy = self._tof.settings.tof.acquisition_cauchy
+        tof, options = self._tof, self._tof.settings.tof
+        tof.cauchy, tof.reassociate = options.acquisition_cauchy, 0.0
         outcome = self._window.acquire(self._narrow)
-        self._tof.cauchy = self._tof.settings.tof.cauchy
+        tof.cauchy, tof.reassociate = options.cauchy, options.reassociate
         return outcome
 
     def look_after(self, time: float, converged: bool) -> None:

@@ -89,7 +89,7 @@ class TofSettings(Settings):
         0.5, gt=0.0, description='the same before the first fit and when lost [m]'
     )
     reassociate: float = Field(
-        0.002, ge=0.0, description='a zone that moved farther is matched to the map anew [m]'
+        0.001, ge=0.0, description='a zone that moved farther is matched to the map anew [m]'
     )
     min_cosine: float = Field(
         0.15, ge=0.0, lt=1.0, description='least cosine of incidence for a match'

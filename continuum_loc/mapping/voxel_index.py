@@ -37,7 +37,7 @@ POINTS_PER_CELL = (
 AXIS_BITS = 19
 AXIS_MASK = (1 << AXIS_BITS) - 1
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)
-SPAN_BITS = 24  # of the length in a block's span
+SPAN_BITS = 32  # of the length in a block's span
 SPAN_MASK = (1 << SPAN_BITS) - 1
 GATHER_LIMIT = 4096  # candidates before pruning
 LIST_LIMIT = 384  # after pruning; longer lists (the centre of a sphere) are not worth keeping
@@ -80,7 +80,7 @@ class VoxelArrays(NamedTuple):
 
     points: (P, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; normals: (P, 3).
     block_slots: (H, 2) hash table from a block's key to its span of sorted points
-        (start * 2^24 + length).
+        (start * 2^32 + length).
     block_spans: (B,) all of them; block_at: (B, 3) each block's place, in blocks.
     reach: distance [m] up to which lists are made.
     cell_slots: (C + COUNTERS, 2) hash table from a cell's and cone's key to their packed list

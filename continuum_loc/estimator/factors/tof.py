@@ -46,6 +46,7 @@ class TofFactor(Factor):
     def __init__(self, robot, grid, settings, prior_map=None, index=None):
         super().__init__(robot, grid, settings)
         self.gate, self.cauchy = settings.tof.gate, settings.tof.cauchy
+        self.reassociate = settings.tof.reassociate
         self.weights = dict.fromkeys((sensor.name for sensor in robot.tof), 1.0)
         self._sensors = {
             sensor.name: (
@@ -152,7 +153,7 @@ class TofFactor(Factor):
             self.cauchy,
             self.gate,
             options.min_cosine,
-            options.reassociate,
+            self.reassociate,
             hits,
             places,
             fits,
