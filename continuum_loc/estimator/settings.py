@@ -181,7 +181,7 @@ class FieldSettings(Settings):
 class SolverSettings(Settings):
     """Gauss-Newton with damping."""
 
-    max_iterations: int = Field(3, ge=1, description='per step while tracking')
+    max_iterations: int = Field(4, ge=1, description='per step while tracking')
     acquisition_iterations: int = Field(
         40, ge=1, description='per step before the first fit and when lost'
     )
