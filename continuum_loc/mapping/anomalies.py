@@ -110,7 +110,7 @@ class AnomalySettings(Settings):
         description="share of a cluster's beams that no edge nearby may explain",
     )
     min_confidence: float = Field(
-        0.5, ge=0.0, le=1.0, description='confidence from which a cluster is worth a look'
+        0.33, ge=0.0, le=1.0, description='confidence from which a cluster is worth a look'
     )
     confidence_z: float = Field(
         1.64, gt=0.0, description="standard deviations of the confidence's lower bound"
