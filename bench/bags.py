@@ -20,10 +20,9 @@ from typing import Any
 
 from continuum_loc.evaluation.bench import one_core, paired, seconds_of
 from continuum_loc.evaluation.trials import simulate, Trial
-from continuum_loc.evaluation.trials import TOPICS as TOPIC_OF
 from msg_tools.bag import BagWriter, read_bag
 from msg_tools.factory import bag_messages, typestore
-from msg_tools.topics import topic_spec
+from msg_tools.topics import topic_of, topic_spec
 import numpy as np
 
 PEER = 'mcap-ros2-support'
@@ -49,7 +48,7 @@ def _messages(samples: list) -> Iterator[tuple[str, str, int, Any]]:
     """(topic, type, stamp, message) of each sample."""
     make = bag_messages()
     for sample in samples:
-        topic = TOPIC_OF[type(sample).__name__]
+        topic = topic_of(sample)
         spec = topic_spec(topic)
         yield topic, spec.type, sample.stamp, _plain(spec.encode(make, sample))
 
@@ -65,12 +64,22 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def write_ours(folder: Path, samples: list) -> None:
+    """Write a bag as `continuum-loc simulate` does."""
+    with BagWriter(folder) as bag:
+        for sample in samples:
+            bag.write(topic_of(sample), sample)
+
+
+def count_ours(folder: Path) -> int:
+    """Read a bag; how many measurements it had."""
+    return sum(1 for _ in read_bag(folder))
+
+
 def _written(folder: Path, samples: list, messages: list, duration: float, repeats: int) -> dict:
     def ours() -> None:
         shutil.rmtree(folder / 'ours', ignore_errors=True)
-        with BagWriter(folder / 'ours') as bag:
-            for sample in samples:
-                bag.write(TOPIC_OF[type(sample).__name__], sample)
+        write_ours(folder / 'ours', samples)
 
     def theirs() -> None:
         from mcap.writer import CompressionType
@@ -96,7 +105,7 @@ def _read(folder: Path, samples: list, duration: float, repeats: int) -> dict:
     counts = {}
 
     def ours() -> None:
-        counts['ours'] = sum(1 for _ in read_bag(folder / 'ours'))
+        counts['ours'] = count_ours(folder / 'ours')
 
     def theirs() -> None:
         counts['theirs'] = sum(1 for _ in read_ros2_messages(str(file)))

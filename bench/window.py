@@ -36,6 +36,7 @@ from threadpoolctl import threadpool_limits
 AGREEMENT = 1e-6  # relative, of the offsets; and of the chain's poses [m, rad]
 KNOTS, FRAMES, ITERATIONS = 6, 240, 4
 BODY = 12  # pose and velocity
+TWIST = np.array([0.1, 0.02, -0.05, 0.3, -0.2, 0.1])  # of the body, and constant [m/s, rad/s]
 SPREAD = np.array([0.02, 0.02, 0.02, 0.05, 0.05, 0.05])  # how far the poor guess is off [m, rad]
 
 
@@ -202,12 +203,11 @@ def _temporal_problem():
     rng = np.random.default_rng(0)
     period = 1.0 / (KNOTS - 1)
     times = np.sort(rng.uniform(0.0, 1.0, FRAMES)).clip(1e-3, 1.0 - 1e-3)
-    twist = np.array([0.1, 0.02, -0.05, 0.3, -0.2, 0.1])
-    measured = lie.exp(times[:, None] * twist) @ lie.exp(1e-3 * rng.normal(size=(FRAMES, 6)))
+    measured = lie.exp(times[:, None] * TWIST) @ lie.exp(1e-3 * rng.normal(size=(FRAMES, 6)))
     directions = rng.normal(size=(FRAMES, 64, 6))
     information = 1e3 * np.einsum('fzi,fzj->fij', directions, directions)
     knots = np.arange(KNOTS)[:, None] * period
-    guess = lie.exp(knots * twist) @ lie.exp(SPREAD * rng.normal(size=(KNOTS, 6)))
+    guess = lie.exp(knots * TWIST) @ lie.exp(SPREAD * rng.normal(size=(KNOTS, 6)))
     return times, measured, information, guess, period
 
 
@@ -229,7 +229,7 @@ def _gauss_newton(times, measured, information, guess, period, psd) -> np.ndarra
     return T
 
 
-@njit(cache=True)
+@njit  # not cached: numba would not see that a kernel of the library has changed
 def _linearise(T, v, tau, knot, measured, information, period, q_inverse, H, g):
     W, V, M = lie_kernels.workspace()
     J_work, index, work = np.empty((2, 6, 24)), np.arange(24), np.empty((6, 24))
@@ -256,14 +256,14 @@ def _linearise(T, v, tau, knot, measured, information, period, q_inverse, H, g):
         gp.gather(H[k], g[k], H_body, g_body, J_pose, work)
 
 
-@njit(cache=True)
+@njit
 def _pose_error(measured, T, residual, J, W, V, M):
     """Residual (6,) = Log(measured^-1 T) and its Jacobian by a right perturbation of T."""
     lie_kernels.relative(measured, T, M[0])
     lie_kernels.log(M[0], residual)
     lie_kernels.ad(residual, W[0])
     lie_kernels.right_inverse_coefficients(residual, V[1], V[2])
-    lie_kernels.polynomial(V[1], W[0], J, W[1])
+    lie_kernels.polynomial(V[1], W[0], J, W[1:3])
 
 
 def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[], np.ndarray]:

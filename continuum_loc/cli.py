@@ -476,8 +476,10 @@ def bench(
     from continuum_loc.evaluation.runs import new_run
 
     names = benches.bench_names()
-    if check:
-        benches.read_baseline()  # before the work, not after it
+    if check:  # what would fail after the work fails before it
+        benches.read_baseline()
+    if baseline:
+        benches.require_places([only] if only in names else names)
     if peers:
         benches.install_peers()
     outcome = benches.run_bench(out or new_run('bench'), quick, only, _each)
@@ -487,7 +489,7 @@ def bench(
     for line in outcome.failures:
         errors.print(f'[bold red]failed:[/] {escape(line)}', highlight=False)
     if baseline:
-        benches.write_baseline(outcome.rows, partial=only is not None)
+        benches.write_baseline(outcome.rows, partial=only is not None or bool(outcome.failures))
         benches.write_document(outcome.rows)
     regressions = outcome.regressions() if check else []
     for line in regressions:

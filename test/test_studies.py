@@ -303,7 +303,8 @@ def test_one_broken_benchmark_does_not_stop_the_others(tmp_path, monkeypatch):
         f"BOUNDS = [('look', 'ratio', 'at least', 5.0)]\ndef run(quick): return [{row()!r}]"
     )
     found = run_bench(tmp_path / 'out', quick=True)
-    assert found.failures == ['a: OSError: no peer']
+    assert found.failures == [f'a: OSError: no peer ({tmp_path}/out/a.traceback.txt)']
+    assert "raise OSError('no peer')" in (tmp_path / 'out' / 'a.traceback.txt').read_text()
     assert [claim.holds for claim in found.claims] == [False]
     assert (
         json.loads((tmp_path / 'out' / 'summary.json').read_text())['failures'] == found.failures

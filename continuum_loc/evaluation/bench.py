@@ -171,7 +171,8 @@ def run_bench(
     """
     Run one benchmark or all, and write the results to `out`.
 
-    Files: `bench.json`, `.md`, `.csv`, `.tex` and `summary.json`.
+    Files: `bench.json`, `.md`, `.csv`, `.tex` and `summary.json`; `NAME.traceback.txt` of a
+    benchmark that failed, which does not stop the others.
     """
     names = bench_names()
     if only is not None and only not in names:
@@ -179,10 +180,10 @@ def run_bench(
     rows, claims, failures = [], [], []
     for name in each([only] if only else names, 'measuring'):
         try:
-            module = _load(name)
+            module = load_benchmark(name)
             measured = module.run(quick)
         except Exception:
-            failures.append(f'{name}: {traceback.format_exc().strip().splitlines()[-1]}')
+            failures.append(_failure(name, out))
             continue
         rows += [{**row, 'benchmark': name} for row in measured]
         claims += bound_claims(measured, getattr(module, 'BOUNDS', ()))
@@ -197,7 +198,18 @@ def run_bench(
     return BenchOutcome(rows, claims, failures)
 
 
-def _load(name: str) -> ModuleType:
+def _failure(name: str, out: Path) -> str:
+    """Keep the traceback of the error being handled; a line that says what and where it is."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / f'{name}.traceback.txt'
+    file.write_text(traceback.format_exc())
+    error = sys.exc_info()[1]
+    first = (str(error).strip().splitlines() or [''])[0]
+    return f'{name}: {type(error).__name__}: {first} ({file})'
+
+
+def load_benchmark(name: str) -> ModuleType:
+    """Load a benchmark of the source tree as a module."""
     path = BENCH_FOLDER / f'{name}.py'
     spec = importlib.util.spec_from_file_location(f'bench_{name}', path)
     module = importlib.util.module_from_spec(spec)
@@ -284,16 +296,26 @@ def write_document(rows: list[dict[str, Any]], path: Path = DOCUMENT) -> None:
     """
     text = path.read_text()
     for name in dict.fromkeys(row['benchmark'] for row in rows):
-        begin, end = f'<!-- bench {name} -->\n', f'<!-- end {name} -->'
-        head, found, rest = text.partition(begin)
-        _, closed, tail = rest.partition(end)
-        if not (found and closed):
-            raise BenchError(
-                f'{path}: no lines {begin.strip()} and {end} to put the table between'
-            )
-        lines = markdown(table([row for row in rows if row['benchmark'] == name]))
-        text = f'{head}{begin}{lines}{end}{tail}'
+        head, tail = _around_table(text, name, path)
+        text = head + markdown(table([row for row in rows if row['benchmark'] == name])) + tail
     path.write_text(text)
+
+
+def require_places(names: Iterable[str], path: Path = DOCUMENT) -> None:
+    """Raise BenchError where the document has no place for the table of a benchmark."""
+    text = path.read_text()
+    for name in names:
+        _around_table(text, name, path)
+
+
+def _around_table(text: str, name: str, path: Path) -> tuple[str, str]:
+    """Text up to and with the marker before a benchmark's table, and from the one after it."""
+    begin, end = f'<!-- bench {name} -->\n', f'<!-- end {name} -->'
+    head, found, rest = text.partition(begin)
+    _, closed, tail = rest.partition(end)
+    if not (found and closed):
+        raise BenchError(f'{path}: no lines {begin.strip()} and {end} to put the table between')
+    return head + begin, end + tail
 
 
 def markdown(cells: list[dict[str, str]]) -> str:
