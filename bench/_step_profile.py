@@ -16,9 +16,8 @@ from time import process_time
 
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.evaluation.bench import one_core
-from continuum_loc.evaluation.trials import make_filter, scene_map
+from continuum_loc.evaluation.trials import make_filter, measured, scene_map, Trial
 from continuum_loc.robot import load_robot
-from engine import recording
 from matplotlib.figure import Figure
 
 PICTURE = Path(__file__).parents[1] / 'docs/pictures/step_profile.png'
@@ -39,7 +38,7 @@ PARTS = {
 
 def main(picture: Path) -> None:
     """Profile, print the parts and draw them."""
-    samples = recording(DURATION)
+    samples = measured(Trial('engine', 'S0', 't2', duration=DURATION))
     estimator = make_filter(
         load_robot('engine'), scene_map('S0'), load_estimator_settings('engine')
     )

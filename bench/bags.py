@@ -19,8 +19,8 @@ import tempfile
 from typing import Any
 
 from continuum_loc.evaluation.bench import one_core, paired, seconds_of
-from continuum_loc.evaluation.trials import simulate, Trial
-from msg_tools.bag import BagWriter, read_bag
+from continuum_loc.evaluation.trials import simulate, Trial, write_bag
+from msg_tools.bag import read_bag
 from msg_tools.factory import bag_messages, typestore
 from msg_tools.topics import topic_of, topic_spec
 import numpy as np
@@ -64,22 +64,10 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def write_ours(folder: Path, samples: list) -> None:
-    """Write a bag as `continuum-loc simulate` does."""
-    with BagWriter(folder) as bag:
-        for sample in samples:
-            bag.write(topic_of(sample), sample)
-
-
-def count_ours(folder: Path) -> int:
-    """Read a bag; how many measurements it had."""
-    return sum(1 for _ in read_bag(folder))
-
-
 def _written(folder: Path, samples: list, messages: list, duration: float, repeats: int) -> dict:
     def ours() -> None:
         shutil.rmtree(folder / 'ours', ignore_errors=True)
-        write_ours(folder / 'ours', samples)
+        write_bag(folder / 'ours', samples)
 
     def theirs() -> None:
         from mcap.writer import CompressionType
@@ -105,7 +93,7 @@ def _read(folder: Path, samples: list, duration: float, repeats: int) -> dict:
     counts = {}
 
     def ours() -> None:
-        counts['ours'] = count_ours(folder / 'ours')
+        counts['ours'] = sum(1 for _ in read_bag(folder / 'ours'))
 
     def theirs() -> None:
         counts['theirs'] = sum(1 for _ in read_ros2_messages(str(file)))

@@ -16,8 +16,8 @@ from time import perf_counter, process_time
 
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.evaluation.bench import alone, one_core
-from continuum_loc.evaluation.trials import make_filter, scene_map, simulate, Trial
-from continuum_loc.measurements import Measurement, seconds, TruthSample
+from continuum_loc.evaluation.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.measurements import Measurement, seconds
 from continuum_loc.robot import load_robot
 import numpy as np
 
@@ -30,7 +30,7 @@ BOUNDS = [
 
 def run(quick: bool = False) -> list[dict]:
     """Rows of name, ours_s and wall_s; the first replay, which may compile, is not counted."""
-    samples = recording(4.0 if quick else 20.0)
+    samples = measured(Trial('engine', 'S0', 't2', duration=4.0 if quick else 20.0))
     with one_core():
         _replayed(samples[: len(samples) // 8])
         gc.collect()
@@ -40,12 +40,6 @@ def run(quick: bool = False) -> list[dict]:
     found = [('engine, a second of data', per_second)]
     found += [(f'engine, step p{q}', np.percentile(steps, q, axis=0)) for q in (50, 95, 99)]
     return [alone(name, processor, wall_s=float(wall)) for name, (processor, wall) in found]
-
-
-def recording(duration: float) -> list[Measurement]:
-    """Simulate what the engine robot's sensors measure along t2."""
-    samples = simulate(Trial('engine', 'S0', 't2', duration=duration))
-    return [sample for sample in samples if not isinstance(sample, TruthSample)]
 
 
 def _replayed(samples: list[Measurement]) -> tuple[np.ndarray, np.ndarray]:

@@ -21,10 +21,10 @@ import time
 from continuum_loc.estimator import SlidingWindowFilter
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
 from continuum_loc.evaluation.bench import alone, one_core
-from continuum_loc.evaluation.trials import scene_map, simulate, Trial
+from continuum_loc.evaluation.trials import measured, scene_map, Trial
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import PATIENCE
-from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame, TruthSample
+from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np
@@ -43,11 +43,7 @@ MAPS = (50_000, 500_000, 5_000_000)
 def run(quick: bool = False) -> list[dict]:
     """Rows of name, ours_s (per step, run or lookup), size, exponent and memory_bytes."""
     duration = 2.5 if quick else 8.0
-    samples = [
-        sample
-        for sample in simulate(Trial('engine', 'S0', 't2', duration=duration))
-        if not isinstance(sample, TruthSample)
-    ]
+    samples = measured(Trial('engine', 'S0', 't2', duration=duration))
     settings, prior = load_estimator_settings('engine'), scene_map('S0')
     with one_core():
         _step(samples[: len(samples) // 4], prior, settings, settled=0.0)  # compiles

@@ -26,8 +26,7 @@ from continuum_loc.estimator.chain import Blocks, Chain, Message, symmetric
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.estimator.state import NODE_DIM
 from continuum_loc.evaluation.bench import one_core, seconds_of, side_by_side
-from continuum_loc.evaluation.trials import make_filter, scene_map, simulate, Trial
-from continuum_loc.measurements import TruthSample
+from continuum_loc.evaluation.trials import make_filter, measured, scene_map, Trial
 from continuum_loc.robot import load_robot
 from numba import njit
 import numpy as np
@@ -85,9 +84,8 @@ def _engine_window() -> tuple[Message, list[Blocks], int]:
     """Start message and normal equations of the engine robot's window; its number of nodes."""
     settings = load_estimator_settings('engine')
     estimator = make_filter(load_robot('engine'), scene_map('S0'), settings)
-    for sample in simulate(Trial('engine', 'S0', 't2', duration=3.0)):
-        if not isinstance(sample, TruthSample):
-            estimator.process(sample)
+    for sample in measured(Trial('engine', 'S0', 't2', duration=3.0)):
+        estimator.process(sample)
     window = estimator.window
     return (
         window.chain.messages[0],

@@ -475,11 +475,11 @@ def bench(
     from continuum_loc.evaluation import bench as benches
     from continuum_loc.evaluation.runs import new_run
 
-    names = benches.bench_names()
+    names = benches.bench_names(only)
     if check:  # what would fail after the work fails before it
         benches.read_baseline()
     if baseline:
-        benches.require_places([only] if only in names else names)
+        benches.require_places(names)
     if peers:
         benches.install_peers()
     outcome = benches.run_bench(out or new_run('bench'), quick, only, _each)

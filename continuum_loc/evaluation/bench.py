@@ -139,18 +139,23 @@ def _fell(row: dict[str, Any], old: dict[str, Any]) -> bool:
     return row['spread'][1] < old['spread'][0] and row['ratio'] < (1.0 - SLACK) * old['ratio']
 
 
-def bench_names() -> list[str]:
+def bench_names(only: str | None = None) -> list[str]:
     """
-    Names of the benchmarks in the source tree.
+    Names of the benchmarks in the source tree, or the one that is asked for.
 
-    Raises BenchError where there is no source tree.
+    Raises BenchError where there is no source tree, or no such benchmark.
     """
     if not BENCH_FOLDER.is_dir():
         raise BenchError(
             f'{BENCH_FOLDER}: no benchmarks; they are in the source tree, '
             'not in the installed package'
         )
-    return sorted(path.stem for path in BENCH_FOLDER.glob('*.py') if not path.name.startswith('_'))
+    names = sorted(
+        path.stem for path in BENCH_FOLDER.glob('*.py') if not path.name.startswith('_')
+    )
+    if only is not None and only not in names:
+        raise BenchError(f"no benchmark '{only}'; benchmarks: {', '.join(names)}")
+    return names if only is None else [only]
 
 
 def install_peers() -> None:
@@ -174,11 +179,9 @@ def run_bench(
     Files: `bench.json`, `.md`, `.csv`, `.tex` and `summary.json`; `NAME.traceback.txt` of a
     benchmark that failed, which does not stop the others.
     """
-    names = bench_names()
-    if only is not None and only not in names:
-        raise BenchError(f"no benchmark '{only}'; benchmarks: {', '.join(names)}")
+    names = bench_names(only)
     rows, claims, failures = [], [], []
-    for name in each([only] if only else names, 'measuring'):
+    for name in each(names, 'measuring'):
         try:
             module = load_benchmark(name)
             measured = module.run(quick)

@@ -138,6 +138,11 @@ def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSa
     return world(trial, faults).run(trial.duration)
 
 
+def measured(trial: Trial) -> list[Measurement]:
+    """List what the sensors of a trial measure: its samples without the truth."""
+    return [sample for sample in simulate(trial) if not isinstance(sample, TruthSample)]
+
+
 def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
     """Simulate and estimate, both in this thread; only the estimator is timed."""
     robot = load_robot(trial.robot)
