@@ -24,7 +24,7 @@ import time
 from continuum_loc.evaluation.bench import one_core, paired, side_by_side
 from continuum_loc.mapping.build import sample_mesh
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import PATIENCE
+from continuum_loc.mapping.facing import PATIENCE
 import numpy as np
 
 BOUNDS = [

@@ -23,7 +23,7 @@ from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_s
 from continuum_loc.evaluation.bench import alone, one_core
 from continuum_loc.evaluation.trials import measured, scene_map, Trial
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import PATIENCE
+from continuum_loc.mapping.facing import PATIENCE
 from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene

@@ -1,7 +1,8 @@
 """The index is exact against brute force and SciPy, for any cloud, query and cache."""
 
 from continuum_loc.mapping.errors import MapError
-from continuum_loc.mapping.voxel_index import PATIENCE, VoxelIndex
+from continuum_loc.mapping.facing import PATIENCE
+from continuum_loc.mapping.voxel_index import VoxelIndex
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -50,15 +51,14 @@ def clouds():
 )
 def test_nearest_is_the_nearest_of_any_cloud(points, queries, max_distance, cell):
     index = VoxelIndex(points, cell=cell, reach=0.2)
-    for _ in range(PATIENCE + 1):  # first by search, then from the lists
-        row, distance = index.nearest(queries, max_distance)
-        expected = brute_force(points, queries, max_distance)
-        np.testing.assert_allclose(distance, expected, rtol=1e-12, atol=1e-15)
-        hit = row >= 0
-        np.testing.assert_array_equal(hit, np.isfinite(expected))
-        np.testing.assert_allclose(
-            np.linalg.norm(points[row[hit]] - queries[hit], axis=1), distance[hit]
-        )
+    row, distance = index.nearest(queries, max_distance)
+    expected = brute_force(points, queries, max_distance)
+    np.testing.assert_allclose(distance, expected, rtol=1e-12, atol=1e-15)
+    hit = row >= 0
+    np.testing.assert_array_equal(hit, np.isfinite(expected))
+    np.testing.assert_allclose(
+        np.linalg.norm(points[row[hit]] - queries[hit], axis=1), distance[hit]
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -75,7 +75,7 @@ def test_nearest_facing_is_the_nearest_that_faces(seed, min_cos, max_distance):
     # Rounding may decide either way on the limit itself.
     clear = np.abs(cosine - min_cos).min(axis=1) > 1e-12
     expected = brute_force(points, queries, max_distance, cosine >= min_cos)
-    for _ in range(PATIENCE + 1):
+    for _ in range(PATIENCE + 1):  # first by search, then from the lists
         _, distance = index.nearest_facing(queries, directions, max_distance, min_cos)
         np.testing.assert_allclose(distance[clear], expected[clear], rtol=1e-12)
 
@@ -87,8 +87,7 @@ def test_agrees_with_a_kd_tree_on_a_large_map_near_and_far():
         [points[:3000] + rng.normal(0, 0.02, (3000, 3)), rng.uniform(-1, 1, (500, 3))]
     )
     index = VoxelIndex(points)
-    for _ in range(PATIENCE):
-        _, distance = index.nearest(queries)
+    _, distance = index.nearest(queries)
     np.testing.assert_allclose(distance, cKDTree(points).query(queries)[0], rtol=1e-12)
 
 
@@ -98,8 +97,7 @@ def test_the_centre_of_a_sphere_where_every_point_is_a_candidate():
     points *= 0.08 / np.linalg.norm(points, axis=1, keepdims=True)
     queries = rng.normal(0, 1e-3, (50, 3))
     index = VoxelIndex(points)
-    for _ in range(PATIENCE):
-        _, distance = index.nearest(queries)
+    _, distance = index.nearest(queries)
     np.testing.assert_allclose(distance, cKDTree(points).query(queries)[0], rtol=1e-12)
 
 
@@ -132,16 +130,59 @@ def test_lists_made_for_one_angle_of_incidence_do_not_serve_another():
             np.testing.assert_allclose(distance, expected, rtol=1e-12)
 
 
+def test_single_precision_never_decides():
+    """
+    Points a nanometre apart, far from the map's corner, and faces on the very limit of a beam.
+
+    The corner is so far away that single precision cannot tell any of these points from another.
+    """
+    rng = np.random.default_rng(12)
+    cluster = np.array([900.0, -400.0, 300.0]) + 1e-9 * rng.integers(-500, 500, (200, 3))
+    points = np.concatenate([cluster, [[0.0, 0.0, 0.0], [-900.0, 400.0, -300.0]]])
+    tilt = rng.choice([-1e-9, 0.0, 1e-9], len(points))
+    normals = np.column_stack([np.cos(tilt), np.sin(tilt), 0.0 * tilt])
+    queries = cluster[:50] + 1e-7 * rng.normal(size=(50, 3))
+    beams = np.tile([0.0, -1.0, 0.0], (50, 1))
+    index = VoxelIndex(points, normals, cell=0.05)
+    faces = -np.einsum('qi,pi->qp', beams, normals) >= 0.0
+    for allowed, ask in (
+        (None, lambda: index.nearest(queries)),
+        (faces, lambda: index.nearest_facing(queries, beams, 0.05, 0.0)),
+    ):
+        expected = brute_force(points, queries, 0.05, allowed)
+        for _ in range(PATIENCE + 1):
+            np.testing.assert_allclose(ask()[1], expected, rtol=1e-12)
+    assert index.cache_use['groups'] > 0
+
+
+def test_where_the_map_lies_changes_nothing():
+    points, normals = wavy_cylinder(5000, 13)
+    points = np.round(points * 2.0**20) / 2.0**20  # so that moving it does not round it
+    rng = np.random.default_rng(14)
+    queries = np.round((points[:500] + rng.normal(0, 0.02, (500, 3))) * 2.0**20) / 2.0**20
+    away = np.array([2.0**21, -(2.0**20), 2.0**10])  # metres, as in a national grid
+    here, there = VoxelIndex(points, normals), VoxelIndex(points + away, normals)
+    for one, other in zip(here.nearest(queries), there.nearest(queries + away), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_cache_that_overflows_changes_nothing():
-    points, _ = wavy_cylinder(20_000, 4)
-    queries = points[:4000] + np.random.default_rng(5).normal(0, 0.01, (4000, 3))
-    small, large = VoxelIndex(points, cache_cells=64), VoxelIndex(points)
-    for _ in range(PATIENCE):
+    """It may be emptied in the middle of a batch, as a batch that alone overflows it shows."""
+    points, normals = wavy_cylinder(20_000, 4)
+    rows = np.arange(4000)
+    queries = points[rows] + np.random.default_rng(5).normal(0, 0.01, (4000, 3))
+    small, large = VoxelIndex(points, normals, cache_cells=64), VoxelIndex(points, normals)
+    # Neighbours in a row, so that the small cache makes lists before it is full.
+    queries, beams = (
+        np.repeat(part, 30, axis=0) for part in (queries[:400], -normals[rows[:400]])
+    )
+    for _ in range(3):
         np.testing.assert_array_equal(
-            small.nearest(queries, 0.1)[0], large.nearest(queries, 0.1)[0]
+            small.nearest_facing(queries, beams, 0.1, 0.2)[0],
+            large.nearest_facing(queries, beams, 0.1, 0.2)[0],
         )
-    assert small.cache_use['emptied'] > 0 and large.cache_use['emptied'] == 0
-    assert small.cache_use['cells'] <= 65
+    assert small.cache_use['emptied'] > 1 and large.cache_use['emptied'] == 1
+    assert small.cache_use['made'] > 64 and small.cache_use['cells'] <= 65
 
 
 def test_a_reserved_index_has_all_its_memory_and_takes_no_more_wherever_it_is_asked():
@@ -166,17 +207,19 @@ def test_a_reserved_index_has_all_its_memory_and_takes_no_more_wherever_it_is_as
         queries = points[rows] + 0.02 * rng.normal(size=(len(rows), 3))
         for _ in range(PATIENCE + 1):
             index.nearest_facing(queries, -normals[rows], 0.1, 0.3)
-    assert index.cache_use['emptied'] > 0 and index.cache_use['candidates'] > 1000
+    assert index.cache_use['emptied'] > 0 and index.cache_use['groups'] > 1000
     after = [array for array in index.arrays if isinstance(array, np.ndarray)][-6:]
     assert all(one is other for one, other in zip(after, cache, strict=True))
 
 
 def test_copies_share_the_cloud_and_not_the_cache():
-    index = VoxelIndex(wavy_cylinder(1000, 6)[0])
+    points, normals = wavy_cylinder(1000, 6)
+    index = VoxelIndex(points, normals).prepare()
     twin = index.copy()
-    twin.nearest(np.tile(index.arrays.points[0, :3], (PATIENCE + 1, 1)))
+    place = np.tile(points[0], (PATIENCE + 1, 1))
+    twin.nearest_facing(place, -normals[0], 0.1, 0.3)
     assert twin.cache_use['made'] == 1 and index.cache_use['made'] == 0
-    assert twin.arrays.points is index.arrays.points
+    assert twin.arrays.points is index.arrays.points and twin.near is index.near
 
 
 @pytest.mark.parametrize('query', [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300]])
@@ -207,6 +250,19 @@ def test_unusable_points_are_refused_by_name(points, said):
 def test_a_cell_too_small_for_the_cloud_is_refused():
     with pytest.raises(MapError, match='too small'):
         VoxelIndex(np.array([[0.0, 0, 0], [1e4, 0, 0]]), cell=1e-4)
+
+
+@pytest.mark.parametrize(
+    ('points', 'options', 'said'),
+    [
+        ([[0.0, 0, 0], [2e9, 0, 0]], {}, 'at most 1e'),
+        ([[0.0, 0, 0]], {'reach': np.inf}, 'finite'),
+        ([[0.0, 0, 0]], {'cell': 0.0}, 'cell must be > 0'),
+    ],
+)
+def test_unusable_sizes_are_refused(points, options, said):
+    with pytest.raises(MapError, match=said):
+        VoxelIndex(np.array(points), **options)
 
 
 def test_facing_needs_normals():

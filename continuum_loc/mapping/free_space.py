@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from continuum_loc.mapping.errors import MapError
+from continuum_loc.mapping.grid import AXIS_BITS, find_slot, pack
 from continuum_loc.mapping.splat_cast import next_cell, start_march
-from continuum_loc.mapping.voxel_index import AXIS_BITS, find_slot, pack
 from numba import njit
 import numpy as np
 

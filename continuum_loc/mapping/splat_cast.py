@@ -6,8 +6,9 @@ Each map point is taken as a small disc on its tangent plane.
 
 from __future__ import annotations
 
+from continuum_loc.mapping.grid import find_slot, pack, span_bounds
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import find_slot, pack, span_bounds, VoxelIndex
+from continuum_loc.mapping.voxel_index import VoxelIndex
 from numba import njit
 import numpy as np
 

@@ -22,7 +22,6 @@ from msg_tools.records import CloudRecord
 import numpy as np
 
 REACH = 0.05  # m, about what a reconstructed point may lie off the map
-CACHE_CELLS = 1 << 13
 
 
 class Trajectory:
@@ -70,7 +69,7 @@ class SeenScene:
         self.duration = duration
         self.skipped = 0  # frames that no smoothed poses span, or that waited for too long
         self._robot, self._prior = robot, prior
-        self._index = None if prior is None else _small_index(prior)
+        self._index = None if prior is None else _ready_index(prior)
         self._search_radius = AnomalySettings().search_radius
         self._frames: list[TofFrame] = []
         self._jobs: deque[tuple[list[TofFrame], RingTrajectory]] = deque()
@@ -156,10 +155,9 @@ class SeenScene:
             self.skipped += len(self._jobs.popleft()[0])
 
 
-def _small_index(prior: PriorMap) -> VoxelIndex:
-    """Index a map for what is looked up once: most points of a cloud never come again."""
-    index = VoxelIndex(prior.points, prior.normals, reach=REACH, cache_cells=CACHE_CELLS)
-    return index.reserve()
+def _ready_index(prior: PriorMap) -> VoxelIndex:
+    """Index a map with all that its lookups need, so that the first cloud does not wait for it."""
+    return prior.index(reach=REACH).prepare()
 
 
 def _joined(parts: list[np.ndarray], empty: tuple[int, ...] = (0,)) -> np.ndarray:

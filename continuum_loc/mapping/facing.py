@@ -1,0 +1,253 @@
+"""
+Lists of the groups that can hold the nearest point facing a beam, made where beams are.
+
+A list belongs to a cell of space and to one of 24 cones of directions: it leaves out what faces no
+direction of the cone, and only what faces all of them rules others out.
+
+Lists are made when a cell has been visited a few times (until then the grid is searched), in
+memory of fixed size: when it is full it is emptied.
+"""
+
+from __future__ import annotations
+
+from continuum_loc.mapping.candidates import HALF_DIAGONAL, prune
+from continuum_loc.mapping.grid import (
+    AXIS_BITS,
+    AXIS_LIMIT,
+    AXIS_MASK,
+    collect,
+    find_slot,
+    pack,
+    ROUNDING,
+    search,
+    span_bounds,
+    table_size,
+)
+from continuum_loc.mapping.lanes import COS_ERROR, facing_lanes, LANES
+from numba import njit
+import numpy as np
+
+GATHER_LIMIT = 1024  # groups before pruning
+LIST_LIMIT = 64  # after pruning; longer lists (the centre of a sphere) are not worth keeping
+LIST_MEAN = 12  # that memory is taken for
+# Visits to a cell before it gets a list, which costs as much as a dozen searches: a body that
+# moves on visits most cells a few times only; where it stays, each list pays.
+PATIENCE = 24
+LENGTH_BITS = 16
+LENGTH_MASK = (1 << LENGTH_BITS) - 1
+CROWDED = -1000  # entry of a cell whose list would be too long
+COUNTERS = (
+    2  # rows after the cell table: [lists kept, groups in them], [lists made, times emptied]
+)
+CONE_COS = 0.85  # of the half-angle of a cone about its axis (0.857 at its farthest corner)
+CONE_SIN = np.sqrt(1.0 - CONE_COS**2)
+CONE_TILT = 0.366  # of the axis of a quarter of a cube's face: (1, tilt, tilt)
+
+
+def empty_cache(cells: int, blocks: int, groups: int) -> dict[str, np.ndarray]:
+    """Arrays of `VoxelArrays` for that many lists; most memory is taken only as it fills."""
+    cell_slots = np.full((table_size(2 * cells) + COUNTERS, 2), -1, np.int64)
+    cell_slots[-COUNTERS:] = 0
+    return {
+        'cell_slots': cell_slots,
+        'lists': np.empty(LIST_MEAN * cells + 2 * GATHER_LIMIT, np.int32),
+        'scratch': np.empty(blocks, np.int64),
+        'scratch_gap2': np.empty(blocks),
+        'marks': np.zeros(groups, np.int64),
+        'made_for': np.full(1, np.nan),
+    }
+
+
+# ------------------------------------------------------------ cones of directions
+
+
+@njit(cache=True)
+def _cone(dx, dy, dz):
+    """Find the cone, 0..23, that holds a direction: a quarter of a face of the cube around it."""
+    x, y, z = abs(dx), abs(dy), abs(dz)
+    if x >= y and x >= z:
+        return ((0 if dx > 0 else 1) << 2) | ((dy > 0) << 1) | (dz > 0)
+    if y >= z:
+        return ((2 if dy > 0 else 3) << 2) | ((dx > 0) << 1) | (dz > 0)
+    return ((4 if dz > 0 else 5) << 2) | ((dx > 0) << 1) | (dy > 0)
+
+
+@njit(cache=True)
+def _cone_axis(cone):
+    """Return the unit axis of a cone."""
+    scale = 1.0 / np.sqrt(1.0 + 2.0 * CONE_TILT * CONE_TILT)
+    face, tilt = cone >> 2, CONE_TILT * scale
+    main = scale if face & 1 == 0 else -scale
+    a = tilt if cone & 2 else -tilt
+    b = tilt if cone & 1 else -tilt
+    if face < 2:
+        return main, a, b
+    if face < 4:
+        return a, main, b
+    return a, b, main
+
+
+@njit(cache=True)
+def _cone_limits(cone, min_cos):
+    """
+    Bounds (may, sure) on the cosine between a surface and the cone's axis.
+
+    From `may` on it may face some direction of the cone, from `sure` on it faces all of them; the
+    latter is 2 where none does.
+    """
+    sine = np.sqrt(max(1.0 - min_cos * min_cos, 0.0))
+    may = min_cos * CONE_COS - sine * CONE_SIN - COS_ERROR
+    sure = min_cos * CONE_COS + sine * CONE_SIN + COS_ERROR
+    return (may if min_cos > -CONE_COS else -2.0), (sure if min_cos < CONE_COS else 2.0)
+
+
+# ------------------------------------------------------------ lists
+
+
+@njit(cache=True)
+def find_facing_lists(arrays, queries, directions, min_cos, start, first, after):
+    """
+    Where the lists for queries (Q, 3) from `start` on and beams (Q, 3) lie in `arrays.lists`.
+
+    first: -1 where there is no list (yet). Returns the query before which the cache has to be
+    emptied, or Q: what was found for those before it must be used up first.
+    """
+    slots, lattice, lists = arrays.cell_slots, arrays.lattice, arrays.lists
+    x0, y0, z0, scale = lattice.x0, lattice.y0, lattice.z0, lattice.inverse_cell
+    table, room = slots.shape[0] - COUNTERS, lists.shape[0] - LIST_LIMIT
+    for q in range(start, queries.shape[0]):
+        first[q], after[q] = 0, 0
+        u = np.floor((queries[q, 0] - x0) * scale)
+        v = np.floor((queries[q, 1] - y0) * scale)
+        w = np.floor((queries[q, 2] - z0) * scale)
+        if not (abs(u) < AXIS_LIMIT and abs(v) < AXIS_LIMIT and abs(w) < AXIS_LIMIT):
+            continue
+        cell = pack(int(u) + AXIS_LIMIT, int(v) + AXIS_LIMIT, int(w) + AXIS_LIMIT)
+        key = (cell << 5) | _cone(directions[q, 0], directions[q, 1], directions[q, 2])
+        row = find_slot(slots, key, table - 1)
+        entry = slots[row, 1]
+        if slots[row, 0] != key or entry < 0:
+            if slots[table, 0] * 2 >= table or slots[table, 1] > room:
+                if q > start:
+                    return q
+                forget_lists(slots)
+                row = find_slot(slots, key, table - 1)
+            entry = _visit(slots, key, row)
+            if CROWDED < entry <= -PATIENCE:
+                entry = _add_list(arrays, key, row, min_cos)
+        first[q], after[q] = -1, -1
+        if entry >= 0:
+            first[q] = entry >> LENGTH_BITS
+            after[q] = first[q] + (entry & LENGTH_MASK)
+    return queries.shape[0]
+
+
+@njit(cache=True)
+def _visit(slots, key, row):
+    """
+    Count a visit to a cell that has no list, whose key belongs in row `row` of the table.
+
+    Returns its entry: minus the number of visits, or CROWDED.
+    """
+    table = slots.shape[0] - COUNTERS
+    if slots[row, 0] != key:
+        slots[row, 0], slots[row, 1] = key, 0
+        slots[table, 0] += 1
+    if slots[row, 1] != CROWDED:
+        slots[row, 1] -= 1
+    return slots[row, 1]
+
+
+@njit(cache=True)
+def forget_lists(slots):
+    """Empty the table, and with it the memory of the lists."""
+    table = slots.shape[0] - COUNTERS
+    slots[:table, 0] = -1
+    slots[table] = 0
+    slots[table + 1, 1] += 1
+
+
+@njit(cache=True)
+def _add_list(arrays, key, row, min_cos):
+    """Give the cell and cone in row `row` of the table its list; its packed entry, or CROWDED."""
+    slots, lattice, place = arrays.cell_slots, arrays.lattice, key >> 5
+    counters = slots[-COUNTERS:]
+    x = ((place >> (2 * AXIS_BITS)) - AXIS_LIMIT + 0.5) * lattice.cell
+    y = (((place >> AXIS_BITS) & AXIS_MASK) - AXIS_LIMIT + 0.5) * lattice.cell
+    z = ((place & AXIS_MASK) - AXIS_LIMIT + 0.5) * lattice.cell
+    begin = counters[0, 1]
+    counters[1, 0] += 1
+    length = _make_list(arrays, x, y, z, key & 31, min_cos, begin)
+    if length < 0:
+        slots[row, 1] = CROWDED
+    else:
+        counters[0, 1] += length
+        slots[row, 1] = (begin << LENGTH_BITS) + length
+    return slots[row, 1]
+
+
+@njit(cache=True)
+def _make_list(arrays, x, y, z, cone, min_cos, begin):
+    """
+    Write the list of the cell with this centre, counted from the lattice's corner, at `begin`.
+
+    Its length (0: no point within reach), or -1 where it is too long.
+    """
+    lattice = arrays.lattice
+    may_cos, sure_cos = _cone_limits(cone, min_cos)
+    axis = _cone_axis(cone)
+    half = HALF_DIAGONAL * lattice.cell
+    limit = arrays.reach + half
+    best, best2, _ = search(
+        arrays.points, arrays.normals, arrays.block_slots, arrays.block_spans, arrays.block_at,
+        lattice, arrays.scratch, arrays.scratch_gap2,
+        x + lattice.x0, y + lattice.y0, z + lattice.z0, axis[0], axis[1], axis[2], sure_cos,
+        limit * limit,
+    )  # fmt: skip
+    radius = limit if best < 0 else min(np.sqrt(best2) + 2.0 * half, limit)
+    groups = np.empty(GATHER_LIMIT, np.int32)
+    may, sure = np.empty(GATHER_LIMIT, np.int64), np.empty(GATHER_LIMIT, np.int64)
+    count = _gather(arrays, x, y, z, radius, axis, may_cos, sure_cos, groups, may, sure)
+    if count < 0:
+        return -1
+    kept = prune(
+        arrays.lanes, groups, may, sure, count,
+        x, y, z, lattice.cell, arrays.reach, lattice.rounding,
+    )  # fmt: skip
+    if kept > LIST_LIMIT:
+        return -1
+    arrays.lists[begin : begin + kept] = groups[:kept]
+    return kept
+
+
+@njit(cache=True)
+def _gather(arrays, x, y, z, radius, axis, may_cos, sure_cos, groups, may, sure):
+    """
+    Find the groups with points that may face, of blocks within `radius` of a place; how many.
+
+    -1 where they are too many. may, sure: bits of the points that may face and that surely do.
+    """
+    lanes, marks, scale = arrays.lanes, arrays.marks, arrays.lattice.inverse_block
+    ax, ay, az = np.float32(axis[0]), np.float32(axis[1]), np.float32(axis[2])
+    stamp = arrays.cell_slots[-1, 0]  # lists made so far: marks what this one has looked at
+    reach = radius * scale * (1.0 + ROUNDING) + ROUNDING
+    blocks = collect(
+        arrays.block_slots, arrays.block_spans, arrays.block_at, arrays.lattice,
+        arrays.scratch, arrays.scratch_gap2, x * scale, y * scale, z * scale, reach, 0.0,
+    )  # fmt: skip
+    count = 0
+    for block in range(blocks):
+        first, after = span_bounds(arrays.scratch[block])
+        for group in range(first // LANES, (after - 1) // LANES + 1):
+            if marks[group] == stamp:
+                continue
+            marks[group] = stamp
+            bits = facing_lanes(lanes, group, ax, ay, az, np.float32(may_cos))
+            if bits == 0:
+                continue
+            if count == GATHER_LIMIT:
+                return -1
+            groups[count], may[count] = group, bits
+            sure[count] = bits & facing_lanes(lanes, group, ax, ay, az, np.float32(sure_cos))
+            count += 1
+    return count

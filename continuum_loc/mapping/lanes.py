@@ -1,0 +1,274 @@
+"""
+Sixteen points side by side in single precision, which a processor compares at once.
+
+A group is sixteen rows of a sorted cloud that lie close together: its row of `lanes`, (G, 6, 16),
+holds their x, y, z from an origin [m] and their normals, coordinate by coordinate. The compiled
+functions here look at all points of one group; a set of its points is the bits of an integer.
+Single precision only sorts out what cannot matter (`slack2` says by how much it may err); what is
+left is settled in double precision by the caller.
+
+The vectors are written out because numba's compiler unrolls a loop over sixteen before it would
+vectorise it. LLVM splits them to whatever width the processor has.
+"""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
+import numpy as np
+
+LANES = 16
+ALL_LANES = (1 << LANES) - 1
+CACHE_LINE = 64  # bytes
+SINGLE = 2.0**-24  # relative rounding of single precision
+COS_ERROR = 1e-6  # bound on the rounding of a cosine of two unit vectors in single precision
+
+_FLOAT, _INT = ir.FloatType(), ir.IntType(64)
+_VECTOR, _BITS = ir.VectorType(_FLOAT, LANES), ir.IntType(LANES)
+_FUSE = ('contract',)  # a product and a sum may be rounded once
+_NUMBERS, _ONE = ir.VectorType(ir.IntType(32), LANES), ir.Constant(_INT, 1)
+_LEAST = 'llvm.vector.reduce.fmin.v16f32'
+single, integer = types.float32, types.int64
+_FOUND = types.Tuple((integer, single, single))
+
+
+def pack_lanes(points: np.ndarray, normals: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """
+    Lanes (G, 6, 16) of sorted points (P, 3) [m] and normals (P, 3).
+
+    The last group is filled up with points so far away that they are never near.
+    """
+    groups = -(-len(points) // LANES)
+    rows = np.zeros((groups * LANES, 6), np.float32)
+    rows[:, :3] = 1e15
+    rows[: len(points), :3], rows[: len(points), 3:] = points - origin, normals
+    lanes = _aligned((groups, 6, LANES))
+    lanes[:] = rows.reshape(groups, LANES, 6).transpose(0, 2, 1)
+    return lanes
+
+
+def _aligned(shape: tuple[int, ...]) -> np.ndarray:
+    """Memory for single precision numbers that begins with a cache line, as each vector then."""
+    spare = CACHE_LINE // 4
+    memory = np.empty(int(np.prod(shape)) + spare, np.float32)
+    first = -memory.ctypes.data % CACHE_LINE // 4
+    return memory[first : first + memory.size - spare].reshape(shape)
+
+
+@njit(cache=True, inline='always')
+def slack2(distance2, rounding):
+    """
+    Bound on the error of a squared distance [m^2] in single precision, near that distance.
+
+    rounding: bound [m] on the error of a difference of two coordinates, 4 `SINGLE` times the
+    largest one.
+    """
+    return 4.0 * rounding * (np.sqrt(distance2) + 4.0 * rounding) + 32.0 * SINGLE * distance2
+
+
+# ------------------------------------------------------------ vectors
+
+
+def _splat(builder, value):
+    """All lanes the same."""
+    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return builder.shuffle_vector(first, undefined, zeros)
+
+
+def _data(context, builder, signature, args, which):
+    """Return where the data of an array begins, of those in `args`."""
+    return make_array(signature.args[which])(context, builder, args[which]).data
+
+
+def _rows(context, builder, signature, args, first, group=None):
+    """Three rows of lanes from `first` on; array and group come first in `args`."""
+    data = _data(context, builder, signature, args, 0)
+    start = builder.mul(args[1] if group is None else group, ir.Constant(_INT, 6 * LANES))
+    for row in range(first, first + 3):
+        at = builder.add(start, ir.Constant(_INT, row * LANES))
+        pointer = builder.bitcast(builder.gep(data, [at]), _VECTOR.as_pointer())
+        yield builder.load(pointer, align=4)
+
+
+def _dot(builder, left, right):
+    """Sum of the products of three vectors each."""
+    total = None
+    for a, b in zip(left, right, strict=True):
+        product = builder.fmul(a, b, flags=_FUSE)
+        total = product if total is None else builder.fadd(total, product, flags=_FUSE)
+    return total
+
+
+def _from(builder, points, place):
+    """Points (three vectors) as seen from a place (three numbers)."""
+    return [
+        builder.fsub(row, _splat(builder, value)) for row, value in zip(points, place, strict=True)
+    ]
+
+
+def _mask(builder, comparison, left, right):
+    """Bits of the lanes where the comparison holds."""
+    holds = builder.fcmp_ordered(comparison, left, right)
+    return builder.zext(builder.bitcast(holds, _BITS), _INT)
+
+
+def _call(builder, name, result, *args):
+    """Call one of LLVM's own functions."""
+    declared = builder.module.globals.get(name) or ir.Function(
+        builder.module, ir.FunctionType(result, [arg.type for arg in args]), name
+    )
+    return builder.call(declared, args, fastmath=('nnan', 'nsz'))
+
+
+# ------------------------------------------------------------ what kernels call
+
+
+@intrinsic
+def near_lanes(_, lanes, group, x, y, z, limit2):
+    """Bits of a group's points that are no farther from a place than sqrt(limit2)."""
+
+    def generate(context, builder, signature, args):
+        seen = _from(builder, _rows(context, builder, signature, args, 0), args[2:5])
+        return _mask(builder, '<=', _dot(builder, seen, seen), _splat(builder, args[5]))
+
+    return integer(lanes, integer, single, single, single, single), generate
+
+
+@intrinsic
+def facing_lanes(_, lanes, group, dx, dy, dz, min_cos):
+    """Bits of a group's points whose normal n has -(n . d) >= min_cos for the direction d."""
+
+    def generate(context, builder, signature, args):
+        direction = [_splat(builder, value) for value in args[2:5]]
+        along = _dot(builder, _rows(context, builder, signature, args, 3), direction)
+        return _mask(builder, '<=', along, _splat(builder, builder.fneg(args[5])))
+
+    return integer(lanes, integer, single, single, single, single), generate
+
+
+@intrinsic
+def two_nearest(_, lanes, groups, first, after, x, y, z):
+    """
+    Find the nearest point to a place in groups[first:after], and how near the next one is.
+
+    Returns its number among all sorted points, and the squared distances [m^2] of both; where
+    there is none they are inf.
+    """
+
+    def generate(context, builder, signature, args):
+        return _two_nearest(context, builder, signature, args, lambda group: None)
+
+    return _FOUND(lanes, groups, integer, integer, single, single, single), generate
+
+
+@intrinsic
+def two_nearest_facing(_, lanes, groups, first, after, x, y, z, dx, dy, dz, min_cos):
+    """Find what `two_nearest` finds, of the points that `facing_lanes` would choose."""
+
+    def generate(context, builder, signature, args):
+        direction = [_splat(builder, value) for value in args[7:10]]
+        limit = _splat(builder, builder.fneg(args[10]))
+
+        def faces(group):
+            normals = _rows(context, builder, signature, args, 3, group)
+            return builder.fcmp_ordered('<=', _dot(builder, normals, direction), limit)
+
+        return _two_nearest(context, builder, signature, args, faces)
+
+    return _FOUND(lanes, groups, integer, integer, *[single] * 7), generate
+
+
+def _two_nearest(context, builder, signature, args, counts):
+    """Each lane keeps its own two nearest; only at the end are lanes compared, which is slow."""
+    far = _splat(builder, ir.Constant(_FLOAT, float('inf')))
+    least, second = (cgutils.alloca_once_value(builder, far) for _ in range(2))
+    holder = cgutils.alloca_once_value(builder, ir.Constant(_NUMBERS, [0] * LANES))
+    listed = _data(context, builder, signature, args, 1)
+    with cgutils.for_range_slice(builder, args[2], args[3], _ONE, _INT) as (at, _):
+        group = builder.load(builder.gep(listed, [at]))
+        row = builder.sext(group, _INT)
+        seen = _from(builder, _rows(context, builder, signature, args, 0, row), args[4:7])
+        found, counted = _dot(builder, seen, seen), counts(row)
+        if counted is not None:
+            found = builder.select(counted, found, far)
+        before = builder.load(least)
+        nearer = builder.fcmp_ordered('<', found, before)
+        builder.store(builder.select(nearer, found, before), least)
+        builder.store(builder.select(nearer, _splat(builder, group), builder.load(holder)), holder)
+        passed = builder.select(nearer, before, found)
+        builder.store(_smaller(builder, passed, builder.load(second)), second)
+    return _compare_lanes(context, builder, signature, *map(builder.load, (least, second, holder)))
+
+
+def _compare_lanes(context, builder, signature, least, second, holder):
+    """Return the number of the nearest point, its squared distance, and that of the next."""
+    best = _call(builder, _LEAST, _FLOAT, least)
+    winners = builder.fcmp_ordered('==', least, _splat(builder, best))
+    lane = builder.cttz(builder.bitcast(winners, _BITS), ir.Constant(ir.IntType(1), 0))
+    lane = builder.zext(lane, ir.IntType(32))
+    numbers = ir.Constant(_NUMBERS, list(range(LANES)))
+    chosen = builder.icmp_signed('==', numbers, _splat(builder, lane))
+    others = builder.select(chosen, second, _smaller(builder, least, second))
+    next_best = _call(builder, _LEAST, _FLOAT, others)
+    group = builder.sext(builder.extract_element(holder, lane), _INT)
+    point = builder.add(builder.mul(group, ir.Constant(_INT, LANES)), builder.zext(lane, _INT))
+    return context.make_tuple(builder, signature.return_type, (point, best, next_best))
+
+
+def _smaller(builder, a, b):
+    return builder.select(builder.fcmp_ordered('<', a, b), a, b)
+
+
+@intrinsic
+def nearest_lane2(_, lanes, group, chosen, x, y, z):
+    """Squared distance [m^2] from a place to a group's nearest chosen point; inf if none."""
+
+    def generate(context, builder, signature, args):
+        seen = _from(builder, _rows(context, builder, signature, args, 0), args[3:6])
+        chosen = builder.bitcast(
+            builder.trunc(args[2], _BITS), ir.VectorType(ir.IntType(1), LANES)
+        )
+        far = _splat(builder, ir.Constant(_FLOAT, float('inf')))
+        distance2 = builder.select(chosen, _dot(builder, seen, seen), far)
+        return _call(builder, _LEAST, _FLOAT, distance2)
+
+    return single(lanes, integer, integer, single, single, single), generate
+
+
+@intrinsic
+def rival_lanes(_, lanes, group, x, y, z, ox, oy, oz, edge, limit2):
+    """
+    Bits of a group's points p that may be nearer than the point o somewhere in a cube.
+
+    The cube has the centre c = (x, y, z) and this edge [m]; they may be where
+    |p - c|^2 - edge |p - o|_1 <= limit2, with limit2 = |o - c|^2.
+    """
+
+    def generate(context, builder, signature, args):
+        points = list(_rows(context, builder, signature, args, 0))
+        seen = _from(builder, points, args[2:5])
+        apart = _from(builder, points, args[5:8])
+        swing = None
+        for part in apart:
+            size = _call(builder, 'llvm.fabs.v16f32', _VECTOR, part)
+            swing = size if swing is None else builder.fadd(swing, size)
+        swing = builder.fmul(swing, _splat(builder, args[8]))
+        gain = builder.fsub(_dot(builder, seen, seen), swing)
+        return _mask(builder, '<=', gain, _splat(builder, args[9]))
+
+    return integer(lanes, integer, *[single] * 8), generate
+
+
+@intrinsic
+def lowest_lane(_, chosen):
+    """Return the number of the first chosen point, of at least one."""
+
+    def generate(context, builder, signature, args):
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return integer(integer), generate
