@@ -4,8 +4,9 @@ Lists of the groups that can hold the nearest point facing a beam, made where be
 A list belongs to a cell of space and to one of 24 cones of directions: it leaves out what faces no
 direction of the cone, and only what faces all of them rules others out.
 
-Lists are made when a cell has been visited a few times (until then the grid is searched), in
-memory of fixed size: when it is full it is emptied.
+Lists are made when a cell has been visited a few times (until then the grid is searched: a body
+that moves on visits most cells once or twice), in memory of fixed size: when it is full it is
+emptied.
 """
 
 from __future__ import annotations
@@ -30,9 +31,7 @@ import numpy as np
 GATHER_LIMIT = 1024  # groups before pruning
 LIST_LIMIT = 64  # after pruning; longer lists (the centre of a sphere) are not worth keeping
 LIST_MEAN = 12  # that memory is taken for
-# Visits to a cell before it gets a list, which costs as much as a dozen searches: a body that
-# moves on visits most cells a few times only; where it stays, each list pays.
-PATIENCE = 24
+PATIENCE = 8  # visits to a cell before it gets a list, which costs about as many searches
 LENGTH_BITS = 16
 LENGTH_MASK = (1 << LENGTH_BITS) - 1
 CROWDED = -1000  # entry of a cell whose list would be too long

@@ -351,9 +351,9 @@ class VoxelIndex:
         if not self._has_normals:
             raise MapError('nearest_facing needs an index made with normals')
         queries = np.ascontiguousarray(queries, dtype=np.float64)
-        directions = np.ascontiguousarray(
-            np.broadcast_to(directions, queries.shape), dtype=np.float64
-        )
+        directions = np.ascontiguousarray(directions, dtype=np.float64)
+        if directions.shape != queries.shape:
+            directions = np.ascontiguousarray(np.broadcast_to(directions, queries.shape))
         index, gap2 = np.empty(len(queries), np.int64), np.empty(len(queries))
         nearest_facing_batch(
             self.arrays, queries, directions, float(max_distance), float(min_cos), index, gap2
