@@ -149,7 +149,7 @@ def near_cells(
     """
     List the groups that matter in each cube within `reach` [m] of the cloud.
 
-    lanes: (G, 6, 16), counted from `origin` (3,) [m]; extent: largest of the cloud's box [m].
+    lanes: (G, 3, 16), counted from `origin` (3,) [m]; extent: largest of the cloud's box [m].
     edge: wanted of a cube [m]; it is doubled until hardly more than `most` cubes are needed.
     """
     margin = reach + edge

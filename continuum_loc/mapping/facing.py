@@ -1,8 +1,9 @@
 """
-Lists of the groups that can hold the nearest point facing a beam, made where beams are.
+Lists of the points that can be the nearest one facing a beam, made where beams are.
 
 A list belongs to a cell of space and to one of 24 cones of directions: it leaves out what faces no
-direction of the cone, and only what faces all of them rules others out.
+direction of the cone, and only what faces all of them rules others out. It holds copies of its
+points, packed into as few groups as they fill.
 
 Lists are made when a cell has been visited a few times (until then the grid is searched: a body
 that moves on visits most cells once or twice), in memory of fixed size: when it is full it is
@@ -24,13 +25,20 @@ from continuum_loc.mapping.grid import (
     span_bounds,
     table_size,
 )
-from continuum_loc.mapping.lanes import COS_ERROR, facing_lanes, LANES
+from continuum_loc.mapping.lanes import (
+    COS_ERROR,
+    empty_lanes,
+    facing_lanes,
+    FAR,
+    LANES,
+    lowest_lane,
+)
 from numba import njit
 import numpy as np
 
 GATHER_LIMIT = 1024  # groups before pruning
-LIST_LIMIT = 64  # after pruning; longer lists (the centre of a sphere) are not worth keeping
-LIST_MEAN = 12  # that memory is taken for
+LIST_LIMIT = 16  # packed groups; longer lists (the centre of a sphere) are not worth keeping
+LIST_MEAN = 2  # that memory is taken for
 PATIENCE = 8  # visits to a cell before it gets a list, which costs about as many searches
 LENGTH_BITS = 16
 LENGTH_MASK = (1 << LENGTH_BITS) - 1
@@ -47,9 +55,12 @@ def empty_cache(cells: int, blocks: int, groups: int) -> dict[str, np.ndarray]:
     """Arrays of `VoxelArrays` for that many lists; most memory is taken only as it fills."""
     cell_slots = np.full((table_size(2 * cells) + COUNTERS, 2), -1, np.int64)
     cell_slots[-COUNTERS:] = 0
+    listed = LIST_MEAN * cells + LIST_LIMIT
     return {
         'cell_slots': cell_slots,
-        'lists': np.empty(LIST_MEAN * cells + 2 * GATHER_LIMIT, np.int32),
+        'list_lanes': empty_lanes(listed),
+        'list_faces': empty_lanes(listed),
+        'list_points': np.empty((listed, LANES), np.int32),
         'scratch': np.empty(blocks, np.int64),
         'scratch_gap2': np.empty(blocks),
         'marks': np.zeros(groups, np.int64),
@@ -106,14 +117,14 @@ def _cone_limits(cone, min_cos):
 @njit(cache=True)
 def find_facing_lists(arrays, queries, directions, min_cos, start, first, after):
     """
-    Where the lists for queries (Q, 3) from `start` on and beams (Q, 3) lie in `arrays.lists`.
+    Where the lists for queries (Q, 3) and beams (Q, 3), from `start` on, lie in the packed groups.
 
     first: -1 where there is no list (yet). Returns the query before which the cache has to be
     emptied, or Q: what was found for those before it must be used up first.
     """
-    slots, lattice, lists = arrays.cell_slots, arrays.lattice, arrays.lists
+    slots, lattice = arrays.cell_slots, arrays.lattice
     x0, y0, z0, scale = lattice.x0, lattice.y0, lattice.z0, lattice.inverse_cell
-    table, room = slots.shape[0] - COUNTERS, lists.shape[0] - LIST_LIMIT
+    table, room = slots.shape[0] - COUNTERS, arrays.list_points.shape[0] - LIST_LIMIT
     for q in range(start, queries.shape[0]):
         first[q], after[q] = 0, 0
         u = np.floor((queries[q, 0] - x0) * scale)
@@ -213,10 +224,35 @@ def _make_list(arrays, x, y, z, cone, min_cos, begin):
         arrays.lanes, groups, may, sure, count,
         x, y, z, lattice.cell, arrays.reach, lattice.rounding,
     )  # fmt: skip
-    if kept > LIST_LIMIT:
-        return -1
-    arrays.lists[begin : begin + kept] = groups[:kept]
-    return kept
+    return _pack(arrays, groups, may, kept, begin)
+
+
+@njit(cache=True)
+def _pack(arrays, groups, chosen, count, begin):
+    """Copy the chosen points of groups to packed groups from `begin` on; how many, or -1."""
+    lanes, faces = arrays.lanes, arrays.faces
+    list_lanes, list_faces, list_points = arrays.list_lanes, arrays.list_faces, arrays.list_points
+    packed = 0
+    for c in range(count):
+        group, left = np.int64(groups[c]), chosen[c]
+        while left != 0:
+            lane = lowest_lane(left)
+            left &= left - 1
+            to, place = begin + packed // LANES, packed % LANES
+            if to - begin == LIST_LIMIT:
+                return -1
+            list_points[to, place] = LANES * group + lane
+            for axis in range(3):
+                list_lanes[to, axis, place] = lanes[group, axis, lane]
+                list_faces[to, axis, place] = faces[group, axis, lane]
+            packed += 1
+    used = -(-packed // LANES)
+    for spare in range(packed, used * LANES):
+        list_points[begin + spare // LANES, spare % LANES] = 0
+        for axis in range(3):
+            list_lanes[begin + spare // LANES, axis, spare % LANES] = FAR
+            list_faces[begin + spare // LANES, axis, spare % LANES] = 0.0
+    return used
 
 
 @njit(cache=True)
@@ -226,7 +262,7 @@ def _gather(arrays, x, y, z, radius, axis, may_cos, sure_cos, groups, may, sure)
 
     -1 where they are too many. may, sure: bits of the points that may face and that surely do.
     """
-    lanes, marks, scale = arrays.lanes, arrays.marks, arrays.lattice.inverse_block
+    faces, marks, scale = arrays.faces, arrays.marks, arrays.lattice.inverse_block
     ax, ay, az = np.float32(axis[0]), np.float32(axis[1]), np.float32(axis[2])
     stamp = arrays.cell_slots[-1, 0]  # lists made so far: marks what this one has looked at
     reach = radius * scale * (1.0 + ROUNDING) + ROUNDING
@@ -241,12 +277,12 @@ def _gather(arrays, x, y, z, radius, axis, may_cos, sure_cos, groups, may, sure)
             if marks[group] == stamp:
                 continue
             marks[group] = stamp
-            bits = facing_lanes(lanes, group, ax, ay, az, np.float32(may_cos))
+            bits = facing_lanes(faces, group, ax, ay, az, np.float32(may_cos))
             if bits == 0:
                 continue
             if count == GATHER_LIMIT:
                 return -1
             groups[count], may[count] = group, bits
-            sure[count] = bits & facing_lanes(lanes, group, ax, ay, az, np.float32(sure_cos))
+            sure[count] = bits & facing_lanes(faces, group, ax, ay, az, np.float32(sure_cos))
             count += 1
     return count

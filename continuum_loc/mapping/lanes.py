@@ -1,9 +1,10 @@
 """
 Sixteen points side by side in single precision, which a processor compares at once.
 
-A group is sixteen rows of a sorted cloud that lie close together: its row of `lanes`, (G, 6, 16),
-holds their x, y, z from an origin [m] and their normals, coordinate by coordinate. The compiled
-functions here look at all points of one group; a set of its points is the bits of an integer.
+A group is sixteen rows of a sorted cloud that lie close together: its row of `lanes`, (G, 3, 16),
+holds their x, y and z from an origin [m], coordinate by coordinate; its row of `faces` their
+normals. The compiled functions here look at all points of a group; a set of its points is the bits
+of an integer.
 Single precision only sorts out what cannot matter (`slack2` says by how much it may err); what is
 left is settled in double precision by the caller.
 
@@ -23,39 +24,35 @@ import numpy as np
 LANES = 16
 ALL_LANES = (1 << LANES) - 1
 CACHE_LINE = 64  # bytes
+FAR = np.float32(1e15)  # m; where a group that is not full has its spare points
 SINGLE = 2.0**-24  # relative rounding of single precision
 COS_ERROR = 1e-6  # bound on the rounding of a cosine of two unit vectors in single precision
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(64)
+_FLOAT, _INT, _SHORT = ir.FloatType(), ir.IntType(64), ir.IntType(32)
 _VECTOR, _BITS = ir.VectorType(_FLOAT, LANES), ir.IntType(LANES)
 _FUSE = ('contract',)  # a product and a sum may be rounded once
-_NUMBERS, _ONE = ir.VectorType(ir.IntType(32), LANES), ir.Constant(_INT, 1)
+_NUMBERS, _ONE = ir.VectorType(_SHORT, LANES), ir.Constant(_INT, 1)
 _LEAST = 'llvm.vector.reduce.fmin.v16f32'
 single, integer = types.float32, types.int64
 _FOUND = types.Tuple((integer, single, single))
 
 
-def pack_lanes(points: np.ndarray, normals: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """
-    Lanes (G, 6, 16) of sorted points (P, 3) [m] and normals (P, 3).
-
-    The last group is filled up with points so far away that they are never near.
-    """
-    groups = -(-len(points) // LANES)
-    rows = np.zeros((groups * LANES, 6), np.float32)
-    rows[:, :3] = 1e15
-    rows[: len(points), :3], rows[: len(points), 3:] = points - origin, normals
-    lanes = _aligned((groups, 6, LANES))
-    lanes[:] = rows.reshape(groups, LANES, 6).transpose(0, 2, 1)
+def pack_lanes(rows: np.ndarray, spare: float) -> np.ndarray:
+    """Lanes (G, 3, 16) of rows (P, 3); the last group is filled up with `spare`."""
+    groups = -(-len(rows) // LANES)
+    filled = np.full((groups * LANES, 3), spare, np.float32)
+    filled[: len(rows)] = rows
+    lanes = empty_lanes(groups)
+    lanes[:] = filled.reshape(groups, LANES, 3).transpose(0, 2, 1)
     return lanes
 
 
-def _aligned(shape: tuple[int, ...]) -> np.ndarray:
-    """Memory for single precision numbers that begins with a cache line, as each vector then."""
-    spare = CACHE_LINE // 4
-    memory = np.empty(int(np.prod(shape)) + spare, np.float32)
+def empty_lanes(groups: int) -> np.ndarray:
+    """Memory for lanes (groups, 3, 16) that begins with a cache line, as each vector then does."""
+    size, spare = groups * 3 * LANES, CACHE_LINE // 4
+    memory = np.empty(size + spare, np.float32)
     first = -memory.ctypes.data % CACHE_LINE // 4
-    return memory[first : first + memory.size - spare].reshape(shape)
+    return memory[first : first + size].reshape(groups, 3, LANES)
 
 
 @njit(cache=True, inline='always')
@@ -75,8 +72,8 @@ def slack2(distance2, rounding):
 def _splat(builder, value):
     """All lanes the same."""
     undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
-    first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    first = builder.insert_element(undefined, value, ir.Constant(_SHORT, 0))
+    zeros = ir.Constant(ir.VectorType(_SHORT, LANES), [0] * LANES)
     return builder.shuffle_vector(first, undefined, zeros)
 
 
@@ -85,14 +82,12 @@ def _data(context, builder, signature, args, which):
     return make_array(signature.args[which])(context, builder, args[which]).data
 
 
-def _rows(context, builder, signature, args, first, group=None):
-    """Three rows of lanes from `first` on; array and group come first in `args`."""
-    data = _data(context, builder, signature, args, 0)
-    start = builder.mul(args[1] if group is None else group, ir.Constant(_INT, 6 * LANES))
-    for row in range(first, first + 3):
-        at = builder.add(start, ir.Constant(_INT, row * LANES))
-        pointer = builder.bitcast(builder.gep(data, [at]), _VECTOR.as_pointer())
-        yield builder.load(pointer, align=4)
+def _vectors(builder, data, group):
+    """Return the three vectors of a group."""
+    start = builder.mul(group, ir.Constant(_INT, 3 * LANES))
+    places = (builder.add(start, ir.Constant(_INT, row * LANES)) for row in range(3))
+    pointers = (builder.bitcast(builder.gep(data, [at]), _VECTOR.as_pointer()) for at in places)
+    return [builder.load(pointer, align=4) for pointer in pointers]
 
 
 def _dot(builder, left, right):
@@ -133,22 +128,24 @@ def near_lanes(_, lanes, group, x, y, z, limit2):
     """Bits of a group's points that are no farther from a place than sqrt(limit2)."""
 
     def generate(context, builder, signature, args):
-        seen = _from(builder, _rows(context, builder, signature, args, 0), args[2:5])
+        points = _vectors(builder, _data(context, builder, signature, args, 0), args[1])
+        seen = _from(builder, points, args[2:5])
         return _mask(builder, '<=', _dot(builder, seen, seen), _splat(builder, args[5]))
 
     return integer(lanes, integer, single, single, single, single), generate
 
 
 @intrinsic
-def facing_lanes(_, lanes, group, dx, dy, dz, min_cos):
+def facing_lanes(_, faces, group, dx, dy, dz, min_cos):
     """Bits of a group's points whose normal n has -(n . d) >= min_cos for the direction d."""
 
     def generate(context, builder, signature, args):
+        normals = _vectors(builder, _data(context, builder, signature, args, 0), args[1])
         direction = [_splat(builder, value) for value in args[2:5]]
-        along = _dot(builder, _rows(context, builder, signature, args, 3), direction)
+        along = _dot(builder, normals, direction)
         return _mask(builder, '<=', along, _splat(builder, builder.fneg(args[5])))
 
-    return integer(lanes, integer, single, single, single, single), generate
+    return integer(faces, integer, single, single, single, single), generate
 
 
 @intrinsic
@@ -156,8 +153,9 @@ def two_nearest(_, lanes, groups, first, after, x, y, z):
     """
     Find the nearest point to a place in groups[first:after], and how near the next one is.
 
-    Returns its number among all sorted points, and the squared distances [m^2] of both; where
-    there is none they are inf.
+    groups: None where groups first..after themselves are meant. Returns the point's number, 16
+    times its group's and its lane, and the squared distances [m^2] of both; inf where there is
+    none.
     """
 
     def generate(context, builder, signature, args):
@@ -167,20 +165,22 @@ def two_nearest(_, lanes, groups, first, after, x, y, z):
 
 
 @intrinsic
-def two_nearest_facing(_, lanes, groups, first, after, x, y, z, dx, dy, dz, min_cos):
+def two_nearest_facing(_, lanes, groups, first, after, x, y, z, faces, dx, dy, dz, min_cos):
     """Find what `two_nearest` finds, of the points that `facing_lanes` would choose."""
 
     def generate(context, builder, signature, args):
-        direction = [_splat(builder, value) for value in args[7:10]]
-        limit = _splat(builder, builder.fneg(args[10]))
+        data = _data(context, builder, signature, args, 7)
+        direction = [_splat(builder, value) for value in args[8:11]]
+        limit = _splat(builder, builder.fneg(args[11]))
 
-        def faces(group):
-            normals = _rows(context, builder, signature, args, 3, group)
-            return builder.fcmp_ordered('<=', _dot(builder, normals, direction), limit)
+        def faces_beam(group):
+            along = _dot(builder, _vectors(builder, data, group), direction)
+            return builder.fcmp_ordered('<=', along, limit)
 
-        return _two_nearest(context, builder, signature, args, faces)
+        return _two_nearest(context, builder, signature, args, faces_beam)
 
-    return _FOUND(lanes, groups, integer, integer, *[single] * 7), generate
+    place = single, single, single
+    return _FOUND(lanes, groups, integer, integer, *place, faces, *place, single), generate
 
 
 def _two_nearest(context, builder, signature, args, counts):
@@ -188,11 +188,12 @@ def _two_nearest(context, builder, signature, args, counts):
     far = _splat(builder, ir.Constant(_FLOAT, float('inf')))
     least, second = (cgutils.alloca_once_value(builder, far) for _ in range(2))
     holder = cgutils.alloca_once_value(builder, ir.Constant(_NUMBERS, [0] * LANES))
-    listed = _data(context, builder, signature, args, 1)
+    lanes, named = _data(context, builder, signature, args, 0), signature.args[1] != types.none
+    listed = _data(context, builder, signature, args, 1) if named else None
     with cgutils.for_range_slice(builder, args[2], args[3], _ONE, _INT) as (at, _):
-        group = builder.load(builder.gep(listed, [at]))
+        group = builder.load(builder.gep(listed, [at])) if named else builder.trunc(at, _SHORT)
         row = builder.sext(group, _INT)
-        seen = _from(builder, _rows(context, builder, signature, args, 0, row), args[4:7])
+        seen = _from(builder, _vectors(builder, lanes, row), args[4:7])
         found, counted = _dot(builder, seen, seen), counts(row)
         if counted is not None:
             found = builder.select(counted, found, far)
@@ -210,7 +211,7 @@ def _compare_lanes(context, builder, signature, least, second, holder):
     best = _call(builder, _LEAST, _FLOAT, least)
     winners = builder.fcmp_ordered('==', least, _splat(builder, best))
     lane = builder.cttz(builder.bitcast(winners, _BITS), ir.Constant(ir.IntType(1), 0))
-    lane = builder.zext(lane, ir.IntType(32))
+    lane = builder.zext(lane, _SHORT)
     numbers = ir.Constant(_NUMBERS, list(range(LANES)))
     chosen = builder.icmp_signed('==', numbers, _splat(builder, lane))
     others = builder.select(chosen, second, _smaller(builder, least, second))
@@ -229,7 +230,8 @@ def nearest_lane2(_, lanes, group, chosen, x, y, z):
     """Squared distance [m^2] from a place to a group's nearest chosen point; inf if none."""
 
     def generate(context, builder, signature, args):
-        seen = _from(builder, _rows(context, builder, signature, args, 0), args[3:6])
+        points = _vectors(builder, _data(context, builder, signature, args, 0), args[1])
+        seen = _from(builder, points, args[3:6])
         chosen = builder.bitcast(
             builder.trunc(args[2], _BITS), ir.VectorType(ir.IntType(1), LANES)
         )
@@ -250,7 +252,7 @@ def rival_lanes(_, lanes, group, x, y, z, ox, oy, oz, edge, limit2):
     """
 
     def generate(context, builder, signature, args):
-        points = list(_rows(context, builder, signature, args, 0))
+        points = _vectors(builder, _data(context, builder, signature, args, 0), args[1])
         seen = _from(builder, points, args[2:5])
         apart = _from(builder, points, args[5:8])
         swing = None

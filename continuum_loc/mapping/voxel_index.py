@@ -40,6 +40,7 @@ from continuum_loc.mapping.grid import (
 from continuum_loc.mapping.lanes import (
     COS_ERROR,
     facing_lanes,
+    FAR,
     LANES,
     lowest_lane,
     near_lanes,
@@ -52,11 +53,14 @@ from continuum_loc.mapping.lanes import (
 from numba import njit
 import numpy as np
 
-POINTS_PER_CUBE = 2.0  # mean over occupied ones: its edge is the measure of the other two
-CUBES_PER_CELL = 2.0  # along an edge; makes lists of about eight groups
-CUBES_PER_BLOCK = 3.0  # along an edge
+POINTS_PER_CELL = 2.0  # mean over occupied ones; makes lists of a group or two
+CELLS_PER_CUBE = (
+    2.0  # along an edge, of those with lists made at once: lists of seven groups or so
+)
+CELLS_PER_BLOCK = 3.0  # along an edge
+SCRATCH = ('scratch', 'scratch_gap2', 'marks')
 SORTED_PER_BLOCK = 8  # along an edge: cubes in whose order the points of a block are sorted
-CELLS_PER_POINT = 1.0  # at most, of those made at once
+CUBES_PER_POINT = 1.5  # at most
 LARGEST = 1e9  # m; a cloud farther across is refused: its single precision would be of no use
 
 
@@ -65,17 +69,18 @@ class VoxelArrays(NamedTuple):
     The index as arrays.
 
     Kernels take it whole and unpack it outside their loops: handing so many arrays on takes
-    longer than most lookups. Only the last six arrays are ever written.
+    longer than most lookups. Only the last eight arrays are ever written.
 
     points: (16 G, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; the last
         group is filled up with points at infinity. normals: (16 G, 3).
-    lanes: (G, 6, 16) the same in groups (`pack_lanes`), from the lattice's corner.
+    lanes, faces: (G, 3, 16) points, from the lattice's corner, and normals in groups.
     block_slots: (H, 2) hash table from a block's key to its span of sorted points.
     block_spans: (B,) all of them; block_at: (B, 3) each block's place, in blocks.
     reach: distance [m] up to which lists are made.
     cell_slots: (C + COUNTERS, 2) hash table from a cell's and cone's key to their packed list
         (start * 2^16 + length), to minus the number of visits so far, or to CROWDED.
-    lists: (L,) the lists end to end: numbers of groups.
+    list_lanes, list_faces: (L, 3, 16) packed groups of the lists, end to end.
+    list_points: (L, 16) their points' rows of `points`.
     scratch, scratch_gap2: (B,) spans of the blocks that a search is about to look at, and their
         squared distances in blocks.
     marks: (G,) the last list for which a group was looked at.
@@ -85,13 +90,16 @@ class VoxelArrays(NamedTuple):
     points: np.ndarray
     normals: np.ndarray
     lanes: np.ndarray
+    faces: np.ndarray
     block_slots: np.ndarray
     block_spans: np.ndarray
     block_at: np.ndarray
     lattice: Lattice
     reach: float
     cell_slots: np.ndarray
-    lists: np.ndarray
+    list_lanes: np.ndarray
+    list_faces: np.ndarray
+    list_points: np.ndarray
     scratch: np.ndarray
     scratch_gap2: np.ndarray
     marks: np.ndarray
@@ -113,9 +121,12 @@ def nearest_batch(arrays, near, queries, max_distance, index, gap2):
     The rows are the caller's; -1 and inf where none lies strictly within `max_distance` [m] or a
     query is not finite. near: `NearCells`.
     """
-    first, after = np.empty(len(queries), np.int64), np.empty(len(queries), np.int64)
+    count = len(queries)
+    first, after = np.empty(count, np.int64), np.empty(count, np.int64)
+    found = np.empty(count, np.int64), np.empty(count, np.float32), np.empty(count, np.float32)
     find_near_lists(near, queries, first, after)
-    scan_lists(arrays, near.groups, queries, max_distance, first, after, index, gap2)
+    _compare(arrays, near.groups, queries, first, after, *found)
+    _settle(arrays, near.groups, queries, max_distance, first, after, *found, index, gap2)
     _search_rest(arrays, queries, queries, max_distance, -1.0, first, index, gap2)
 
 
@@ -129,34 +140,63 @@ def nearest_facing_batch(arrays, queries, directions, max_distance, min_cos, ind
     if arrays.made_for[0] != min_cos:
         forget_lists(arrays.cell_slots)
         arrays.made_for[0] = min_cos
-    first, after = np.empty(len(queries), np.int64), np.empty(len(queries), np.int64)
+    count = len(queries)
+    first, after = np.empty(count, np.int64), np.empty(count, np.int64)
+    found = np.empty(count, np.int64), np.empty(count, np.float32), np.empty(count, np.float32)
     begin = 0
-    while begin < len(queries):
+    while begin < count:
         end = find_facing_lists(arrays, queries, directions, min_cos, begin, first, after)
-        scan_lists_facing(
-            arrays, queries[begin:end], directions[begin:end], max_distance, min_cos,
-            first[begin:end], after[begin:end], index[begin:end], gap2[begin:end],
+        _compare_facing(
+            arrays, queries, directions, min_cos, begin, end, first, after, *found
+        )  # fmt: skip
+        _settle_facing(
+            arrays, queries, directions, max_distance, min_cos, begin, end, first, after, *found,
+            index, gap2,
         )  # fmt: skip
         begin = end
     _search_rest(arrays, queries, directions, max_distance, min_cos, first, index, gap2)
 
 
 @njit(cache=True)
-def scan_lists(arrays, groups, queries, max_distance, first, after, index, gap2):
-    """Find the nearest point to each query (Q, 3) in its list, groups[first:after]."""
-    lanes, points, rounding = arrays.lanes, arrays.points, arrays.lattice.rounding
-    x0, y0, z0 = arrays.lattice.x0, arrays.lattice.y0, arrays.lattice.z0
+def _compare(arrays, groups, queries, first, after, nearest, least2, next2):
+    """Find the two nearest to each query in its list, groups[first:after], in single precision."""
+    lanes, lattice = arrays.lanes, arrays.lattice
+    x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
+    for q in range(queries.shape[0]):
+        nearest[q], least2[q], next2[q] = two_nearest(
+            lanes, groups, first[q], after[q],
+            np.float32(queries[q, 0] - x0), np.float32(queries[q, 1] - y0),
+            np.float32(queries[q, 2] - z0),
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def _settle(
+    arrays, groups, queries, max_distance, first, after, nearest, least2, next2, index, gap2
+):
+    """
+    Decide in double precision which point is nearest, and whether it is near enough.
+
+    Nearly always no other one comes into question.
+    """
+    lanes, points, lattice, rounding = (
+        arrays.lanes,
+        arrays.points,
+        arrays.lattice,
+        arrays.lattice.rounding,
+    )
+    x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
     for q in range(queries.shape[0]):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        sx, sy, sz = np.float32(x - x0), np.float32(y - y0), np.float32(z - z0)
-        p, least, second = two_nearest(lanes, groups, first[q], after[q], sx, sy, sz)
-        within2 = np.float32(least + 2.0 * slack2(least, rounding))
         best2, row = max_distance * max_distance, -1.0
-        if second > within2:  # nearly always
+        within2 = np.float32(least2[q] + 2.0 * slack2(least2[q], rounding))
+        if next2[q] > within2:
+            p = nearest[q]
             d2 = distance2(points, p, x, y, z)
             if d2 < best2:
                 best2, row = d2, points[p, 3]
-        elif least < np.inf:
+        elif least2[q] < np.inf:
+            sx, sy, sz = np.float32(x - x0), np.float32(y - y0), np.float32(z - z0)
             for c in range(first[q], after[q]):
                 group = np.int64(groups[c])
                 chosen = near_lanes(lanes, group, sx, sy, sz, within2)
@@ -170,46 +210,63 @@ def scan_lists(arrays, groups, queries, max_distance, first, after, index, gap2)
 
 
 @njit(cache=True)
-def scan_lists_facing(
-    arrays, queries, directions, max_distance, min_cos, first, after, index, gap2
+def _compare_facing(
+    arrays, queries, directions, min_cos, begin, end, first, after, nearest, least2, next2
 ):
+    """As `_compare`, for queries begin..end, among the points of their lists that may face."""
+    lanes, faces, lattice = arrays.list_lanes, arrays.list_faces, arrays.lattice
+    x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
+    may = np.float32(min_cos - COS_ERROR)
+    for q in range(begin, end):
+        nearest[q], least2[q], next2[q] = two_nearest_facing(
+            lanes, None, first[q], after[q],
+            np.float32(queries[q, 0] - x0), np.float32(queries[q, 1] - y0),
+            np.float32(queries[q, 2] - z0), faces,
+            np.float32(directions[q, 0]), np.float32(directions[q, 1]),
+            np.float32(directions[q, 2]), may,
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def _settle_facing(
+    arrays, queries, directions, max_distance, min_cos, begin, end, first, after,
+    nearest, least2, next2, index, gap2,
+):  # fmt: skip
     """
-    As `scan_lists`, among those that face the beam.
+    As `_settle`, for queries begin..end, among those that face the beam.
 
     Sets `first` to -1 where that does not settle it: a point that all but faces the beam is nearer
     than one that does.
     """
-    lanes, points, normals, groups = arrays.lanes, arrays.points, arrays.normals, arrays.lists
-    x0, y0, z0 = arrays.lattice.x0, arrays.lattice.y0, arrays.lattice.z0
-    rounding, may = arrays.lattice.rounding, np.float32(min_cos - COS_ERROR)
-    for q in range(queries.shape[0]):
+    lanes, faces, listed = arrays.list_lanes, arrays.list_faces, arrays.list_points
+    points, normals, lattice = arrays.points, arrays.normals, arrays.lattice
+    x0, y0, z0, rounding = lattice.x0, lattice.y0, lattice.z0, lattice.rounding
+    may = np.float32(min_cos - COS_ERROR)
+    for q in range(begin, end):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
-        sx, sy, sz = np.float32(x - x0), np.float32(y - y0), np.float32(z - z0)
-        bx, by, bz = np.float32(dx), np.float32(dy), np.float32(dz)
-        p, least, second = two_nearest_facing(
-            lanes, groups, first[q], after[q], sx, sy, sz, bx, by, bz, may
-        )
-        slack = slack2(least, rounding)
-        within2 = np.float32(least + 2.0 * slack)
-        best2, row = max_distance * max_distance, -1.0
-        if second > within2 and toward(normals, p, dx, dy, dz) >= min_cos:  # nearly always
-            d2 = distance2(points, p, x, y, z)
-            if d2 < best2:
-                best2, row = d2, points[p, 3]
-        elif least < best2 + slack:
-            for c in range(first[q], after[q]):
-                group = np.int64(groups[c])
+        best2, row, slack = max_distance * max_distance, -1.0, slack2(least2[q], rounding)
+        within2, settled = np.float32(least2[q] + 2.0 * slack), least2[q] == np.inf
+        if next2[q] > within2:
+            p = np.int64(listed[nearest[q] // LANES, nearest[q] % LANES])
+            if toward(normals, p, dx, dy, dz) >= min_cos:
+                settled, d2 = True, distance2(points, p, x, y, z)
+                if d2 < best2:
+                    best2, row = d2, points[p, 3]
+        if not settled:
+            sx, sy, sz = np.float32(x - x0), np.float32(y - y0), np.float32(z - z0)
+            bx, by, bz = np.float32(dx), np.float32(dy), np.float32(dz)
+            for group in range(first[q], after[q]):
                 chosen = near_lanes(lanes, group, sx, sy, sz, within2)
-                chosen &= facing_lanes(lanes, group, bx, by, bz, may)
+                chosen &= facing_lanes(faces, group, bx, by, bz, may)
                 while chosen != 0:
-                    p = LANES * group + lowest_lane(chosen)
+                    p = np.int64(listed[group, lowest_lane(chosen)])
                     chosen &= chosen - 1
                     d2 = distance2(points, p, x, y, z)
                     if d2 < best2 or (d2 == best2 and points[p, 3] < row):
                         if toward(normals, p, dx, dy, dz) >= min_cos:
                             best2, row = d2, points[p, 3]
-            if best2 > least + slack:
+            if best2 > least2[q] + slack:
                 first[q] = -1
         index[q], gap2[q] = np.int64(row), best2 if row >= 0.0 else np.inf
 
@@ -245,10 +302,10 @@ class VoxelIndex:
     Nearest-neighbour index of a fixed cloud; see the module's docstring for how it works.
 
     points: (P, 3) [m], finite, P >= 1. normals: (P, 3) unit, needed for `nearest_facing`.
-    cell: edge of a cell [m], by default so that an occupied one holds eight points or so.
+    cell: edge of a cell [m], by default so that an occupied one holds two points or so.
     reach: largest distance [m] that is served at full speed; larger ones are exact too, but
     searched for.
-    cache_cells: lists for `nearest_facing` kept at a time (about 100 bytes each).
+    cache_cells: lists for `nearest_facing` kept at a time (about 1 kB each).
     """
 
     def __init__(
@@ -267,7 +324,7 @@ class VoxelIndex:
         extent = float(np.ptp(points, axis=0).max())
         if extent > LARGEST:
             raise MapError(f'the cloud is {extent:.3g} m across; at most {LARGEST:g} m is valid')
-        self.cell = float(cell) if cell is not None else CUBES_PER_CELL * _suitable_cube(points)
+        self.cell = float(cell) if cell is not None else _suitable_cell(points)
         if not self.cell > 0.0 or not 0.0 <= reach < np.inf:
             raise MapError(
                 f'cell must be > 0 and reach >= 0 and finite, got cell {cell!r}, reach {reach!r}'
@@ -287,10 +344,10 @@ class VoxelIndex:
             arrays.lanes,
             np.array([lattice.x0, lattice.y0, lattice.z0]),
             self._extent,
-            lattice.cell,
+            CELLS_PER_CUBE * lattice.cell,
             arrays.reach,
             lattice.rounding,
-            most=max(int(CELLS_PER_POINT * len(arrays.points)), 4096),
+            most=max(int(CUBES_PER_POINT * len(arrays.points)), 4096),
         )
 
     def prepare(self) -> VoxelIndex:
@@ -308,7 +365,7 @@ class VoxelIndex:
 
     def reserve(self) -> VoxelIndex:
         """Take the cache's memory at once, not in the course of a long run; return self."""
-        for name in ('lists', 'scratch', 'scratch_gap2', 'marks'):
+        for name in ('list_lanes', 'list_faces', 'list_points', *SCRATCH):
             getattr(self.arrays, name).fill(0)
         return self
 
@@ -373,26 +430,26 @@ def _checked_rows(rows: np.ndarray, name: str) -> np.ndarray:
     return rows
 
 
-def _suitable_cube(points: np.ndarray) -> float:
-    """Edge at which occupied cubes hold about POINTS_PER_CUBE points, for points on a surface."""
+def _suitable_cell(points: np.ndarray) -> float:
+    """Edge at which occupied cells hold about POINTS_PER_CELL points, for points on a surface."""
     extent = float(np.ptp(points, axis=0).max())
     if extent == 0.0:
         return 1.0
     origin = points.min(axis=0)
     smallest = extent / (AXIS_LIMIT // 2)
-    edge = max(extent * np.sqrt(POINTS_PER_CUBE / len(points)), smallest)
-    for _ in range(4):  # occupancy grows as the square of the edge
-        occupied = 1 + np.count_nonzero(np.diff(np.sort(morton_codes(points, origin, 1.0 / edge))))
-        edge = max(edge * np.sqrt(POINTS_PER_CUBE * occupied / len(points)), smallest)
-        if edge >= extent:
+    cell = max(extent * np.sqrt(POINTS_PER_CELL / len(points)), smallest)
+    for _ in range(4):  # occupancy grows as the square of the cell
+        occupied = 1 + np.count_nonzero(np.diff(np.sort(morton_codes(points, origin, 1.0 / cell))))
+        cell = max(cell * np.sqrt(POINTS_PER_CELL * occupied / len(points)), smallest)
+        if cell >= extent:
             return extent
-    return edge
+    return cell
 
 
 def _build(
     points: np.ndarray, normals: np.ndarray, cell: float, reach: float, cache_cells: int
 ) -> VoxelArrays:
-    origin, block = points.min(axis=0), CUBES_PER_BLOCK / CUBES_PER_CELL * cell
+    origin, block = points.min(axis=0), CELLS_PER_BLOCK * cell
     extent = np.ptp(points, axis=0).max()
     if np.floor(extent / cell) >= AXIS_LIMIT:
         raise MapError(
@@ -403,11 +460,12 @@ def _build(
     spans = span(first, np.diff(first, append=len(points)))
     slots = np.full((table_size(4 * len(first)), 2), -1, np.int64)
     enter(pack_all(at.astype(np.int64)), spans, slots)
-    lanes = pack_lanes(points[order], normals[order], origin)
+    lanes = pack_lanes(points[order] - origin, FAR)
     return VoxelArrays(
         points=_filled(np.column_stack([points[order], order.astype(np.float64)]), np.inf),
         normals=_filled(normals[order], 0.0),
         lanes=lanes,
+        faces=pack_lanes(normals[order], 0.0),
         block_slots=slots,
         block_spans=spans,
         block_at=at,
