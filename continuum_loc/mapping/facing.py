@@ -40,7 +40,7 @@ GATHER_LIMIT = 1024  # groups before pruning
 LIST_LIMIT = 16  # packed groups; longer lists (the centre of a sphere) are not worth keeping
 LIST_MEAN = 2  # that memory is taken for
 PATIENCE = 8  # visits to a cell before it gets a list, which costs about as many searches
-LENGTH_BITS = 16
+LENGTH_BITS = 16  # of a list's length in its entry
 LENGTH_MASK = (1 << LENGTH_BITS) - 1
 CROWDED = -1000  # entry of a cell whose list would be too long
 COUNTERS = (
@@ -51,8 +51,13 @@ CONE_SIN = np.sqrt(1.0 - CONE_COS**2)
 CONE_TILT = 0.366  # of the axis of a quarter of a cube's face: (1, tilt, tilt)
 
 
+TAKEN_AS_FILLED = (
+    'list_lanes', 'list_faces', 'list_points', 'scratch', 'scratch_gap2', 'marks'
+)  # fmt: skip
+
+
 def empty_cache(cells: int, blocks: int, groups: int) -> dict[str, np.ndarray]:
-    """Arrays of `VoxelArrays` for that many lists; most memory is taken only as it fills."""
+    """Arrays of `VoxelArrays` for that many lists; those `TAKEN_AS_FILLED` cost nothing yet."""
     cell_slots = np.full((table_size(2 * cells) + COUNTERS, 2), -1, np.int64)
     cell_slots[-COUNTERS:] = 0
     listed = LIST_MEAN * cells + LIST_LIMIT
@@ -248,10 +253,8 @@ def _pack(arrays, groups, chosen, count, begin):
             packed += 1
     used = -(-packed // LANES)
     for spare in range(packed, used * LANES):
-        list_points[begin + spare // LANES, spare % LANES] = 0
-        for axis in range(3):
-            list_lanes[begin + spare // LANES, axis, spare % LANES] = FAR
-            list_faces[begin + spare // LANES, axis, spare % LANES] = 0.0
+        list_lanes[begin + spare // LANES, :, spare % LANES] = FAR
+        list_faces[begin + spare // LANES, :, spare % LANES] = np.nan  # faces nothing
     return used
 
 

@@ -24,7 +24,9 @@ import numpy as np
 LANES = 16
 ALL_LANES = (1 << LANES) - 1
 CACHE_LINE = 64  # bytes
-FAR = np.float32(1e15)  # m; where a group that is not full has its spare points
+FAR = np.float32(
+    1e15
+)  # m; where a group that is not full has its spare points, facing nowhere (nan)
 SINGLE = 2.0**-24  # relative rounding of single precision
 COS_ERROR = 1e-6  # bound on the rounding of a cosine of two unit vectors in single precision
 

@@ -23,7 +23,7 @@ from continuum_loc.estimator.factors.base import (
     Repeats,
 )
 from continuum_loc.estimator.state import VELOCITY
-from continuum_loc.mapping.voxel_index import nearest_facing_batch
+from continuum_loc.mapping.lookup import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from numba import njit
 import numpy as np
