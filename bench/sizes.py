@@ -22,8 +22,9 @@ from continuum_loc.estimator import SlidingWindowFilter
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
 from continuum_loc.evaluation.bench import alone, one_core
 from continuum_loc.evaluation.trials import measured, scene_map, Trial
-from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.facing import PATIENCE
+from continuum_loc.mapping.prior_map import PriorMap
+from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
@@ -117,7 +118,7 @@ def _durations(
 
 
 def _maps(samples: list[Measurement], settings: EstimatorSettings, quick: bool) -> list[dict]:
-    """Time a step, and a lookup of 1000 places near the surface that was made before."""
+    """Time a step, and a lookup for 1000 beams near the surface that was made before."""
     steps, lookups, memory = [], [], []
     for points in MAPS[:2] if quick else MAPS:
         prior = _random_map(points)
@@ -132,15 +133,17 @@ def _maps(samples: list[Measurement], settings: EstimatorSettings, quick: bool) 
     ]
 
 
-def _lookup(prior: PriorMap, index) -> float:
+def _lookup(prior: PriorMap, index: VoxelIndex) -> float:
+    """Time what the filter asks: the nearest point that faces the beam, where beams have been."""
     rng = np.random.default_rng(0)
-    places = prior.points[rng.integers(0, len(prior), 1000)] + rng.normal(0, 0.005, (1000, 3))
+    rows = rng.integers(0, len(prior), 1000)
+    places, beams = prior.points[rows] + rng.normal(0, 0.005, (1000, 3)), -prior.normals[rows]
     for _ in range(PATIENCE + 1):
-        index.nearest(places, 0.1)
+        index.nearest_facing(places, beams, 0.1, 0.1)
     times = []
     for _ in range(50):
         started = time.process_time()
-        index.nearest(places, 0.1)
+        index.nearest_facing(places, beams, 0.1, 0.1)
         times.append((time.process_time() - started) / len(places))
     return float(np.median(times))
 

@@ -30,6 +30,7 @@ from continuum_loc.mapping.lanes import (
     empty_lanes,
     facing_lanes,
     FAR,
+    fetch,
     LANES,
     lowest_lane,
 )
@@ -128,6 +129,7 @@ def find_facing_lists(arrays, queries, directions, min_cos, start, first, after)
     emptied, or Q: what was found for those before it must be used up first.
     """
     slots, lattice = arrays.cell_slots, arrays.lattice
+    list_lanes, list_faces, list_points = arrays.list_lanes, arrays.list_faces, arrays.list_points
     x0, y0, z0, scale = lattice.x0, lattice.y0, lattice.z0, lattice.inverse_cell
     table, room = slots.shape[0] - COUNTERS, arrays.list_points.shape[0] - LIST_LIMIT
     for q in range(start, queries.shape[0]):
@@ -154,6 +156,10 @@ def find_facing_lists(arrays, queries, directions, min_cos, start, first, after)
         if entry >= 0:
             first[q] = entry >> LENGTH_BITS
             after[q] = first[q] + (entry & LENGTH_MASK)
+            for row in range(3 * first[q], 3 * first[q] + 3):
+                fetch(list_lanes, row * LANES)
+                fetch(list_faces, row * LANES)
+            fetch(list_points, first[q] * LANES)
     return queries.shape[0]
 
 

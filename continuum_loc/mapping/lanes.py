@@ -114,12 +114,12 @@ def _mask(builder, comparison, left, right):
     return builder.zext(builder.bitcast(holds, _BITS), _INT)
 
 
-def _call(builder, name, result, *args):
+def _call(builder, name, result, *args, fastmath=('nnan', 'nsz')):
     """Call one of LLVM's own functions."""
     declared = builder.module.globals.get(name) or ir.Function(
         builder.module, ir.FunctionType(result, [arg.type for arg in args]), name
     )
-    return builder.call(declared, args, fastmath=('nnan', 'nsz'))
+    return builder.call(declared, args, fastmath=fastmath)
 
 
 # ------------------------------------------------------------ what kernels call
@@ -276,3 +276,18 @@ def lowest_lane(_, chosen):
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return integer(integer), generate
+
+
+@intrinsic
+def fetch(_, array, at):
+    """Ask for the element `at` of a C-ordered array ahead of its use: memory is slow."""
+
+    def generate(context, builder, signature, args):
+        place = builder.gep(_data(context, builder, signature, args, 0), [args[1]])
+        place = builder.bitcast(place, ir.IntType(8).as_pointer())
+        read, second_level, data_cache = (ir.Constant(_SHORT, value) for value in (0, 2, 1))
+        flags = read, second_level, data_cache
+        _call(builder, 'llvm.prefetch.p0', ir.VoidType(), place, *flags, fastmath=())
+        return context.get_dummy_value()
+
+    return types.none(array, integer), generate

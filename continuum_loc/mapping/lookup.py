@@ -17,6 +17,7 @@ from continuum_loc.mapping.grid import distance2, in_range, Lattice, search, tow
 from continuum_loc.mapping.lanes import (
     COS_ERROR,
     facing_lanes,
+    fetch,
     LANES,
     lowest_lane,
     near_lanes,
@@ -170,18 +171,30 @@ def _settle(
 def _compare_facing(
     arrays, queries, directions, min_cos, begin, end, first, after, nearest, least2, next2
 ):
-    """As `_compare`, for queries begin..end, among the points of their lists that may face."""
-    lanes, faces, lattice = arrays.list_lanes, arrays.list_faces, arrays.lattice
+    """
+    As `_compare`, for queries begin..end, among the points of their lists that may face.
+
+    nearest holds rows of `points`; ~row where single precision cannot tell that it faces the beam.
+    """
+    lanes, faces, listed = arrays.list_lanes, arrays.list_faces, arrays.list_points
+    points, lattice = arrays.points, arrays.lattice
     x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
-    may = np.float32(min_cos - COS_ERROR)
+    may, sure = np.float32(min_cos - COS_ERROR), np.float32(min_cos + COS_ERROR)
     for q in range(begin, end):
-        nearest[q], least2[q], next2[q] = two_nearest_facing(
+        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
+        bx, by, bz = np.float32(dx), np.float32(dy), np.float32(dz)
+        found, least2[q], next2[q] = two_nearest_facing(
             lanes, None, first[q], after[q],
             np.float32(queries[q, 0] - x0), np.float32(queries[q, 1] - y0),
-            np.float32(queries[q, 2] - z0), faces,
-            np.float32(directions[q, 0]), np.float32(directions[q, 1]),
-            np.float32(directions[q, 2]), may,
+            np.float32(queries[q, 2] - z0), faces, bx, by, bz, may,
         )  # fmt: skip
+        group, lane = found // LANES, found % LANES
+        row = np.int64(listed[group, lane])
+        fetch(points, 4 * row)
+        facing = -(
+            faces[group, 0, lane] * bx + faces[group, 1, lane] * by + faces[group, 2, lane] * bz
+        )
+        nearest[q] = row if facing >= sure else ~row
 
 
 @njit(cache=True)
@@ -205,8 +218,8 @@ def _settle_facing(
         best2, row, slack = max_distance * max_distance, -1.0, slack2(least2[q], rounding)
         within2, settled = np.float32(least2[q] + 2.0 * slack), least2[q] == np.inf
         if next2[q] > within2:
-            p = np.int64(listed[nearest[q] // LANES, nearest[q] % LANES])
-            if toward(normals, p, dx, dy, dz) >= min_cos:
+            p = nearest[q] if nearest[q] >= 0 else ~nearest[q]
+            if p == nearest[q] or toward(normals, p, dx, dy, dz) >= min_cos:
                 settled, d2 = True, distance2(points, p, x, y, z)
                 if d2 < best2:
                     best2, row = d2, points[p, 3]
