@@ -218,10 +218,11 @@ def _halve(lanes, parents, begins, groups, edge, margin, reach, rounding):
             kept = prune(lanes, listed, may, sure, after - first, x, y, z, edge, reach, rounding)
             if kept == 0:
                 continue
-            if ends[count] + kept > found.shape[0]:
-                found = np.concatenate((found, np.empty(found.shape[0] + kept, np.int32)))
-            found[ends[count] : ends[count] + kept] = listed[:kept]
-            ends.append(ends[count] + kept)
+            begin, end = ends[count], ends[count] + kept
+            if end > found.shape[0]:
+                found = np.concatenate((found, np.empty(end, np.int32)))
+            found[begin:end] = listed[:kept]
+            ends.append(end)
             count += 1
     return cells[:count].copy(), np.array(ends), found[: ends[count]].copy()
 

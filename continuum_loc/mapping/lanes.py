@@ -54,7 +54,8 @@ def empty_lanes(groups: int) -> np.ndarray:
     size, spare = groups * 3 * LANES, CACHE_LINE // 4
     memory = np.empty(size + spare, np.float32)
     first = -memory.ctypes.data % CACHE_LINE // 4
-    return memory[first : first + size].reshape(groups, 3, LANES)
+    after = first + size
+    return memory[first:after].reshape(groups, 3, LANES)
 
 
 @njit(cache=True, inline='always')
