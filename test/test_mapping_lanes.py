@@ -99,9 +99,8 @@ def test_the_two_nearest_of_a_list_and_of_those_that_face(seed, listed):
     points, normals, rng = cloud(seed)
     lanes, faces = pack_lanes(points, FAR), pack_lanes(normals, np.nan)
     place, beam = points[rng.integers(len(points))] + np.float32(0.5), normals[0]
-    distance2 = np.full((5, LANES), np.inf)
-    distance2.reshape(-1)[: len(points)] = np.sum((points - place) ** 2, axis=1)
-    distance2.reshape(-1)[len(points) :] = np.sum((np.full(3, FAR) - place) ** 2)
+    filled = np.concatenate([points, np.full((5 * LANES - len(points), 3), FAR)])
+    distance2 = np.sum((filled - place) ** 2, axis=1).reshape(5, LANES)
     may = np.zeros((5, LANES), bool)
     may.reshape(-1)[: len(points)] = -normals @ beam >= 0.25
     groups = np.array(listed, np.int32)

@@ -40,7 +40,7 @@ import numpy as np
 GATHER_LIMIT = 1024  # groups before pruning
 LIST_LIMIT = 16  # packed groups; longer lists (the centre of a sphere) are not worth keeping
 LIST_MEAN = 2  # that memory is taken for
-PATIENCE = 8  # visits to a cell before it gets a list, which costs about as many searches
+PATIENCE = 24  # visits before a cell gets a list; most cells of a body that moves on see fewer
 LENGTH_BITS = 16  # of a list's length in its entry
 LENGTH_MASK = (1 << LENGTH_BITS) - 1
 CROWDED = -1000  # entry of a cell whose list would be too long
