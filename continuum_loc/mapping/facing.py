@@ -44,14 +44,11 @@ PATIENCE = 24  # visits before a cell gets a list; most cells of a body that mov
 LENGTH_BITS = 16  # of a list's length in its entry
 LENGTH_MASK = (1 << LENGTH_BITS) - 1
 CROWDED = -1000  # entry of a cell whose list would be too long
-COUNTERS = (
-    2  # rows after the cell table: [lists kept, groups in them], [lists made, times emptied]
-)
+# Rows after the cell table: [keys in it, groups in lists], [lists made, times emptied].
+COUNTERS = 2
 CONE_COS = 0.85  # of the half-angle of a cone about its axis (0.857 at its farthest corner)
 CONE_SIN = np.sqrt(1.0 - CONE_COS**2)
 CONE_TILT = 0.366  # of the axis of a quarter of a cube's face: (1, tilt, tilt)
-
-
 TAKEN_AS_FILLED = (
     'list_lanes', 'list_faces', 'list_points', 'scratch', 'scratch_gap2', 'marks'
 )  # fmt: skip

@@ -33,8 +33,8 @@ class VoxelArrays(NamedTuple):
     """
     The index as arrays.
 
-    Kernels take it whole and unpack it outside their loops: handing so many arrays on takes
-    longer than most lookups. Only the last eight arrays are ever written.
+    Kernels take it whole and unpack it outside their loops. Only the last eight arrays are ever
+    written.
 
     points: (16 G, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; the last
         group is filled up with points at infinity. normals: (16 G, 3).
@@ -104,9 +104,7 @@ def nearest_facing_batch(arrays, queries, directions, max_distance, min_cos, ind
     begin = 0
     while begin < count:
         end = find_facing_lists(arrays, queries, directions, min_cos, begin, first, after)
-        _compare_facing(
-            arrays, queries, directions, min_cos, begin, end, first, after, *found
-        )  # fmt: skip
+        _compare_facing(arrays, queries, directions, min_cos, begin, end, first, after, *found)
         _settle_facing(
             arrays, queries, directions, max_distance, min_cos, begin, end, first, after, *found,
             index, gap2,
@@ -137,13 +135,8 @@ def _settle(
 
     Nearly always no other one comes into question.
     """
-    lanes, points, lattice, rounding = (
-        arrays.lanes,
-        arrays.points,
-        arrays.lattice,
-        arrays.lattice.rounding,
-    )
-    x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
+    lanes, points, lattice = arrays.lanes, arrays.points, arrays.lattice
+    x0, y0, z0, rounding = lattice.x0, lattice.y0, lattice.z0, lattice.rounding
     for q in range(queries.shape[0]):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         best2, row = max_distance * max_distance, -1.0
