@@ -66,7 +66,7 @@ def run(quick: bool = False) -> list[dict]:
 
 def scaling(quick: bool = False) -> list[dict]:
     """
-    Rows of points, build_s, lookup_s and index_bytes.
+    Rows of points, build_s, lookup_s, index_bytes, lists and groups (in a list, on average).
 
     Times are seconds, of a lookup in filter frames.
     """
@@ -85,7 +85,17 @@ def scaling(quick: bool = False) -> list[dict]:
         size = sum(
             array.nbytes for array in (*index.arrays, *index.near) if isinstance(array, np.ndarray)
         )
-        rows.append({'points': count, 'build_s': built, 'lookup_s': lookup, 'index_bytes': size})
+        lists = np.count_nonzero(np.diff(index.near.begins))
+        rows.append(
+            {
+                'points': count,
+                'build_s': built,
+                'lookup_s': lookup,
+                'index_bytes': size,
+                'lists': lists,
+                'groups': len(index.near.groups) / lists,
+            }
+        )
     return rows
 
 
@@ -302,5 +312,6 @@ if __name__ == '__main__':
     for row in scaling():
         print(
             f'{row["points"]:9d} points: built in {row["build_s"]:.2f} s, '
-            f'{row["index_bytes"] / 1e6:.0f} MB, lookup {row["lookup_s"] * 1e9:.0f} ns'
+            f'{row["index_bytes"] / 1e6:.0f} MB, {row["lists"]} lists of {row["groups"]:.1f} groups, '
+            f'lookup {row["lookup_s"] * 1e9:.0f} ns'
         )
