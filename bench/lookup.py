@@ -312,6 +312,7 @@ if __name__ == '__main__':
     for row in scaling():
         print(
             f'{row["points"]:9d} points: built in {row["build_s"]:.2f} s, '
-            f'{row["index_bytes"] / 1e6:.0f} MB, {row["lists"]} lists of {row["groups"]:.1f} groups, '
+            f'{row["index_bytes"] / 1e6:.0f} MB, '
+            f'{row["lists"]} lists of {row["groups"]:.1f} groups, '
             f'lookup {row["lookup_s"] * 1e9:.0f} ns'
         )
