@@ -82,7 +82,7 @@ class VoxelIndex:
     @cached_property
     def near(self) -> NearCells:
         """
-        What `nearest` looks up in.
+        Return what `nearest` looks up in.
 
         It is made at first use, which takes about three times as long as the index itself.
         """
