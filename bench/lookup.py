@@ -263,11 +263,10 @@ def _compare_facing(prior, index, peer, query, batches, repeats) -> list[dict]:
     new = _compare_new_beams(index, beams, any_point, query, batches, repeats)
     for _ in range(PATIENCE):
         _ask(ours, batches)
-    name, (other, first_of, share) = (
+    name, (other, first_of) = (
         'lookup, facing the beam',
         _first_that_faces(prior, beams, ours, batches),
     )
-    other = f'{other}, first of {NEIGHBOURS} (finds {share:.0%})'
     return [
         _compare(name, ours, any_point, query, batches, repeats),
         _compare(name, ours, other, first_of, batches, repeats),
@@ -288,7 +287,7 @@ def _compare_new_beams(index, beams, peer, query, batches, repeats) -> dict:
 
 
 def _first_that_faces(prior: PriorMap, beams: np.ndarray, ours: Query, batches: list[np.ndarray]):
-    """Ask a tree for several neighbours: its name, the query, its share of our answers."""
+    """Ask a tree for several neighbours: its name and share of our answers, and the query."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(prior.points)
@@ -299,7 +298,7 @@ def _first_that_faces(prior: PriorMap, beams: np.ndarray, ours: Query, batches: 
         return np.where(faces.any(axis=1), rows[np.arange(len(q)), faces.argmax(axis=1)], -1)
 
     share = np.mean([np.mean(query(batch) == ours(batch)[0]) for batch in batches[:3]])
-    return 'SciPy cKDTree', query, share
+    return f'SciPy cKDTree, first of {NEIGHBOURS} (finds {share:.0%})', query
 
 
 if __name__ == '__main__':

@@ -265,6 +265,14 @@ def test_unusable_sizes_are_refused(points, options, said):
         VoxelIndex(np.array(points), **options)
 
 
+@pytest.mark.parametrize('shape', [(3,), (4, 2)])
+def test_queries_of_another_shape_are_refused(shape):
+    index = VoxelIndex(np.zeros((1, 3)), np.ones((1, 3)))
+    for ask in (index.nearest, lambda q: index.nearest_facing(q, [0.0, 0.0, 1.0])):
+        with pytest.raises(MapError, match='queries must be'):
+            ask(np.zeros(shape))
+
+
 def test_facing_needs_normals():
     with pytest.raises(MapError, match='normals'):
         VoxelIndex(np.zeros((1, 3))).nearest_facing(np.zeros((1, 3)), np.ones((1, 3)))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 from continuum_loc.mapping.grid import AXIS_BITS, enter, find_slot, pack, pack_all, table_size
 from continuum_loc.mapping.lanes import (
     ALL_LANES,
+    LANES,
     lowest_lane,
     near_lanes,
     nearest_lane2,
@@ -86,35 +87,34 @@ def prune(lanes, groups, may, sure, count, x, y, z, edge, reach, rounding):
             qx = np.float32(x + edge * ((corner & 1) - 0.5))
             qy = np.float32(y + edge * (((corner >> 1) & 1) - 0.5))
             qz = np.float32(z + edge * (((corner >> 2) & 1) - 0.5))
-        group, lane = _nearest_sure(lanes, groups, sure, kept, qx, qy, qz)
-        if group < 0:
+        point = _nearest_sure(lanes, groups, sure, kept, qx, qy, qz)
+        if point < 0:
             return kept
-        if (group << 8) + lane == last:
+        if point == last:
             continue
-        last = (group << 8) + lane
-        kept = _drop_ruled_out(
-            lanes, groups, may, sure, kept, group, lane, cx, cy, cz, edge, error
-        )
+        last = point
+        kept = _drop_ruled_out(lanes, groups, may, sure, kept, point, cx, cy, cz, edge, error)
     return kept
 
 
 @njit(cache=True)
 def _nearest_sure(lanes, groups, sure, count, x, y, z):
-    """(group or -1, lane) of the point, of those that count for certain, nearest to a place."""
+    """Find the point, of those that count for certain, nearest to a place; its number, or -1."""
     least, at = np.float32(np.inf), -1
     for c in range(count):
         gap2 = nearest_lane2(lanes, np.int64(groups[c]), sure[c], x, y, z)
         if gap2 < least:
             least, at = gap2, c
     if at < 0:
-        return np.int64(-1), np.int64(-1)
+        return np.int64(-1)
     group, limit2 = np.int64(groups[at]), np.float32(least * (1.0 + 32.0 * SINGLE))
-    return group, lowest_lane(sure[at] & near_lanes(lanes, group, x, y, z, limit2))
+    return LANES * group + lowest_lane(sure[at] & near_lanes(lanes, group, x, y, z, limit2))
 
 
 @njit(cache=True)
-def _drop_ruled_out(lanes, groups, may, sure, count, group, lane, x, y, z, edge, error):
-    """Drop what the point `lane` of `group` is closer than at all of the cube; how many stay."""
+def _drop_ruled_out(lanes, groups, may, sure, count, point, x, y, z, edge, error):
+    """Drop what this point is closer than at all of the cube; how many groups stay."""
+    group, lane = point // LANES, point % LANES
     ox, oy, oz = lanes[group, 0, lane], lanes[group, 1, lane], lanes[group, 2, lane]
     own2 = (ox - x) ** 2 + (oy - y) ** 2 + (oz - z) ** 2
     limit2, size, kept = np.float32(own2 + error), np.float32(edge), 0

@@ -19,6 +19,7 @@ from continuum_loc.mapping.grid import (
     AXIS_MASK,
     collect,
     find_slot,
+    in_range,
     pack,
     ROUNDING,
     search,
@@ -131,12 +132,15 @@ def find_facing_lists(arrays, queries, directions, min_cos, start, first, after)
     table, room = slots.shape[0] - COUNTERS, arrays.list_points.shape[0] - LIST_LIMIT
     for q in range(start, queries.shape[0]):
         first[q], after[q] = 0, 0
-        u = np.floor((queries[q, 0] - x0) * scale)
-        v = np.floor((queries[q, 1] - y0) * scale)
-        w = np.floor((queries[q, 2] - z0) * scale)
-        if not (abs(u) < AXIS_LIMIT and abs(v) < AXIS_LIMIT and abs(w) < AXIS_LIMIT):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        if not in_range(lattice, x, y, z):
             continue
-        cell = pack(int(u) + AXIS_LIMIT, int(v) + AXIS_LIMIT, int(w) + AXIS_LIMIT)
+        i, j, k = (
+            np.floor((x - x0) * scale),
+            np.floor((y - y0) * scale),
+            np.floor((z - z0) * scale),
+        )
+        cell = pack(int(i) + AXIS_LIMIT, int(j) + AXIS_LIMIT, int(k) + AXIS_LIMIT)
         key = (cell << 5) | _cone(directions[q, 0], directions[q, 1], directions[q, 2])
         row = find_slot(slots, key, table - 1)
         entry = slots[row, 1]

@@ -135,7 +135,7 @@ class VoxelIndex:
         They are -1 and inf where none is nearer than max_distance [m]. Of equally near points the
         first is taken.
         """
-        queries = np.ascontiguousarray(queries, dtype=np.float64)
+        queries = _checked_queries(queries)
         index, gap2 = np.empty(len(queries), np.int64), np.empty(len(queries))
         nearest_batch(self.arrays, self.near, queries, float(max_distance), index, gap2)
         return index, np.sqrt(gap2)
@@ -154,7 +154,7 @@ class VoxelIndex:
         """
         if not self._has_normals:
             raise MapError('nearest_facing needs an index made with normals')
-        queries = np.ascontiguousarray(queries, dtype=np.float64)
+        queries = _checked_queries(queries)
         directions = np.ascontiguousarray(directions, dtype=np.float64)
         if directions.shape != queries.shape:
             directions = np.ascontiguousarray(np.broadcast_to(directions, queries.shape))
@@ -175,6 +175,13 @@ def _checked_rows(rows: np.ndarray, name: str) -> np.ndarray:
             f'{name}: {len(bad)} of {len(rows)} rows are not finite, the first is row {bad[0]}'
         )
     return rows
+
+
+def _checked_queries(queries: np.ndarray) -> np.ndarray:
+    queries = np.ascontiguousarray(queries, dtype=np.float64)
+    if queries.ndim != 2 or queries.shape[1] != 3:
+        raise MapError(f'queries must be (Q, 3), got {queries.shape}')
+    return queries
 
 
 def _suitable_cell(points: np.ndarray) -> float:
