@@ -6,7 +6,7 @@ PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
 RUN := $(VENV)/bin
-SOURCES := setup.py continuum_loc msg_tools test bench launch
+SOURCES := setup.py continuum_loc msg_tools studies test bench launch
 
 # A linter of ROS where it is installed: the command $(1); elsewhere a line that says so, with $(2).
 define ament

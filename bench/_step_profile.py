@@ -14,9 +14,9 @@ import pstats
 import sys
 from time import process_time
 
+from bench.harness import one_core
 from continuum_loc.estimator.settings import load_estimator_settings
-from continuum_loc.evaluation.bench import one_core
-from continuum_loc.evaluation.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
 from continuum_loc.robot import load_robot
 from matplotlib.figure import Figure
 

@@ -18,8 +18,8 @@ import shutil
 import tempfile
 from typing import Any
 
-from continuum_loc.evaluation.bench import one_core, paired, seconds_of
-from continuum_loc.evaluation.trials import simulate, Trial, write_bag
+from bench.harness import one_core, paired, seconds_of
+from continuum_loc.offline.trials import simulate, Trial, write_bag
 from msg_tools.bag import read_bag
 from msg_tools.factory import bag_messages, typestore
 from msg_tools.topics import topic_of, topic_spec

@@ -14,10 +14,10 @@ from __future__ import annotations
 import gc
 from time import perf_counter, process_time
 
+from bench.harness import alone, one_core
 from continuum_loc.estimator.settings import load_estimator_settings
-from continuum_loc.evaluation.bench import alone, one_core
-from continuum_loc.evaluation.trials import make_filter, measured, scene_map, Trial
 from continuum_loc.measurements import Measurement, seconds
+from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
 from continuum_loc.robot import load_robot
 import numpy as np
 

@@ -21,10 +21,10 @@ DURATION, QUICK_DURATION = 20.0, 8.0  # s
 
 def run(quick: bool = False) -> list[dict]:
     """Rows of name and ours_s; `rate_hz` where a row is about messages."""
-    from continuum_loc.evaluation.bench import alone
-    from continuum_loc.evaluation.footprint import Footprint
-    from continuum_loc.evaluation.trials import scene_map_file
-    from continuum_loc.nodes.live import run_live
+    from bench.harness import alone
+    from continuum_loc.offline.live import run_live
+    from continuum_loc.offline.trials import scene_map_file
+    from studies.support.footprint import Footprint
 
     footprint = Footprint(period=0.5)
     with tempfile.TemporaryDirectory() as scratch:

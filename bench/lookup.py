@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import time
 
-from continuum_loc.evaluation.bench import one_core, paired, side_by_side
+from bench.harness import one_core, paired, side_by_side
 from continuum_loc.mapping.build import sample_mesh
 from continuum_loc.mapping.facing import PATIENCE
 from continuum_loc.mapping.prior_map import PriorMap

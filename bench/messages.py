@@ -19,7 +19,7 @@ from collections import namedtuple
 from collections.abc import Iterable
 from typing import Any
 
-from continuum_loc.evaluation.bench import one_core, side_by_side
+from bench.harness import one_core, side_by_side
 from continuum_loc.measurements import TOF_VALID, TofFrame
 from msg_tools import convert
 from msg_tools.clouds import DATATYPES

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from continuum_loc.evaluation.bench import one_core, side_by_side
+from bench.harness import one_core, side_by_side
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.raycast import cast_capsules, RayCaster
 from continuum_loc.simulator.scene import Scene, scene_of_solid

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import os
 
+from bench.harness import alone
 from continuum_loc.estimator import load_estimator_settings, SlidingWindowFilter
-from continuum_loc.evaluation.bench import alone
 from continuum_loc.robot import load_robot
 import numpy as np
 
@@ -29,8 +29,8 @@ def run(quick: bool = False) -> list[dict]:
     """Rows of name, ours_s (median over steps, in seconds) and p95_s; there is no peer to run."""
     if not BOUNDS:
         return []
-    from continuum_loc.evaluation.studies.real import data_folder, estimates, ROBOT
-    from msg_tools.tendon_robot import read_recording
+    from studies.real import data_folder, estimates, ROBOT
+    from studies.support.tendon_robot import read_recording
 
     robot = load_robot(ROBOT)
     recording = read_recording(data_folder() / 'impulse_2', robot)

@@ -21,12 +21,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from time import process_time
 
-from continuum_loc.evaluation.bench import alone, one_core, side_by_side
+from bench.harness import alone, one_core, side_by_side
+from continuum_loc.magnet import field_and_gradient
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.shape import ShapeEstimator, ShapeSettings
-from continuum_loc.shape.magnet import field_and_gradient
 from continuum_loc.shape.position import PositionSolver
-from continuum_loc.shape.simulate import Arm, bent, groove_motion, out_of_plane
+from continuum_loc.simulator.hall_arm import Arm, bent, groove_motion, out_of_plane
 import numpy as np
 from scipy.optimize import Bounds, least_squares, minimize
 

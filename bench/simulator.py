@@ -8,11 +8,11 @@ rays beside MuJoCo's.
 
 from __future__ import annotations
 
-from continuum_loc.evaluation.bench import alone, one_core
-from continuum_loc.evaluation.studies.simulator import seconds_of_processor
+from bench.harness import alone, one_core
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.world import World
+from studies.simulator import seconds_of_processor
 
 # What is meant to hold: 1.5 times real time.
 BOUNDS = [('vl53l5cx, trajectory', 'ours_s', 'at most', 1.0 / 1.5)]

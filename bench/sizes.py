@@ -18,14 +18,14 @@ from collections.abc import Iterator
 from pathlib import Path
 import time
 
+from bench.harness import alone, one_core
 from continuum_loc.estimator import SlidingWindowFilter
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
-from continuum_loc.evaluation.bench import alone, one_core
-from continuum_loc.evaluation.trials import measured, scene_map, Trial
 from continuum_loc.mapping.facing import PATIENCE
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame
+from continuum_loc.offline.trials import measured, scene_map, Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np

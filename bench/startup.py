@@ -20,8 +20,8 @@ import sys
 import tempfile
 import time
 
-from continuum_loc.evaluation.bench import alone, one_core
-from continuum_loc.evaluation.trials import scene_map, simulate, Trial, write_bag
+from bench.harness import alone, one_core
+from continuum_loc.offline.trials import scene_map, simulate, Trial, write_bag
 import numpy as np
 
 BOUNDS = [
@@ -30,8 +30,8 @@ BOUNDS = [
 ]
 
 _ESTIMATE = """
-from continuum_loc.evaluation.trials import Trial, make_filter, scene_map
-from continuum_loc.evaluation.replay import samples_of
+from continuum_loc.offline.trials import Trial, make_filter, scene_map
+from continuum_loc.offline.replay import samples_of
 from continuum_loc.measurements import TruthSample
 from continuum_loc.robot import load_robot
 estimator = make_filter(load_robot("engine"), scene_map("S0"))
@@ -99,7 +99,7 @@ def _peak_memory(pid: int) -> int:
 
 
 def _started(command: list[str]) -> subprocess.Popen:
-    from continuum_loc.nodes.domain import Domain
+    from continuum_loc.offline.domain import Domain
 
     with Domain() as alone:  # which the process holds as long as it lives
         return subprocess.Popen(

@@ -20,13 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from bench.harness import one_core, seconds_of, side_by_side
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.chain import Blocks, Chain, Message, symmetric
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.estimator.state import NODE_DIM
-from continuum_loc.evaluation.bench import one_core, seconds_of, side_by_side
-from continuum_loc.evaluation.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
 from continuum_loc.robot import load_robot
 from numba import njit
 import numpy as np

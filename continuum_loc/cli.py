@@ -14,15 +14,15 @@ from pathlib import Path
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
+from continuum_loc.errors import ContinuumLocError, InputError, StudyError
 from rich.console import Console
 from rich.markup import escape
 import typer
 
 if TYPE_CHECKING:
-    from continuum_loc.evaluation.study import Claim
+    from continuum_loc.offline.claims import Claim
 
 OK, FAILED, USAGE = 0, 1, 2
-OUR_PACKAGES = ('continuum_loc', 'msg_tools')
 
 app = typer.Typer(
     name='continuum-loc',
@@ -65,11 +65,9 @@ def main() -> None:
     """
     try:
         app()
-    except Exception as error:
-        if type(error).__module__.split('.')[0] not in OUR_PACKAGES:
-            raise
+    except ContinuumLocError as error:
         errors.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False, soft_wrap=True)
-        sys.exit(USAGE if isinstance(error, ValueError) else FAILED)
+        sys.exit(USAGE if isinstance(error, InputError) else FAILED)
 
 
 @app.command()
@@ -86,8 +84,8 @@ def demo(
 
     Example: `continuum-loc demo --trajectory t2 --duration 10`
     """
-    from continuum_loc.evaluation.demo import run_demo
-    from continuum_loc.evaluation.trials import Trial
+    from continuum_loc.offline.demo import run_demo
+    from continuum_loc.offline.trials import Trial
 
     with _busy() as status:
         outcome = run_demo(
@@ -140,7 +138,7 @@ def simulate(
 
     Example: `continuum-loc simulate /tmp/trial --scene S3 --trajectory t2 --seed 4`
     """
-    from continuum_loc.evaluation.trials import Trial, world, write_bag
+    from continuum_loc.offline.trials import Trial, world, write_bag
 
     trial = Trial(
         robot,
@@ -172,7 +170,9 @@ def import_trial_command(
     Example: `continuum-loc import-trial slow_free_space /tmp/slow`
     """
     from continuum_loc.robot import load_robot
-    from msg_tools.tendon_robot import import_trial
+
+    require_research()
+    from studies.support.tendon_robot import import_trial
 
     _count_table(import_trial(folder, bag, load_robot(robot)), str(bag))
 
@@ -200,11 +200,11 @@ def replay(
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
     from continuum_loc.estimator import settings_of
-    from continuum_loc.evaluation.replay import replay as run_replay
-    from continuum_loc.evaluation.replay import samples_of
-    from continuum_loc.evaluation.runs import new_run, save_run
-    from continuum_loc.evaluation.trials import make_filter, scene_map_file
     from continuum_loc.mapping.map_files import load_map
+    from continuum_loc.offline.replay import replay as run_replay
+    from continuum_loc.offline.replay import samples_of
+    from continuum_loc.offline.runs import new_run, save_run
+    from continuum_loc.offline.trials import make_filter, scene_map_file
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
@@ -250,10 +250,10 @@ def shape(
 
     Example: `continuum-loc shape bench_top.mcap --robot my_arm.yaml`
     """
-    from continuum_loc.evaluation.replay import replay as run_replay
-    from continuum_loc.evaluation.replay import samples_of
-    from continuum_loc.evaluation.runs import new_run, save_run
-    from continuum_loc.evaluation.shape_replay import ShapeReplay
+    from continuum_loc.offline.replay import replay as run_replay
+    from continuum_loc.offline.replay import samples_of
+    from continuum_loc.offline.runs import new_run, save_run
+    from continuum_loc.offline.shape_replay import ShapeReplay
     from continuum_loc.robot import load_robot
     from continuum_loc.shape import load_shape_settings
 
@@ -295,10 +295,9 @@ def tune(
     import tempfile
 
     from continuum_loc.estimator.settings import settings_of
-    from continuum_loc.evaluation.split import hold_out
-    from continuum_loc.evaluation.trials import scene_map_file, simulate, write_bag
-    from continuum_loc.evaluation.tune import FACTORS, PARAMETERS
-    from continuum_loc.evaluation.tune import tune as sweep
+    from continuum_loc.offline.trials import scene_map_file, simulate, write_bag
+    from continuum_loc.offline.tune import FACTORS, hold_out, PARAMETERS
+    from continuum_loc.offline.tune import tune as sweep
     from continuum_loc.robot import load_robot
     from continuum_loc.settings import dump_settings
     from rich.progress import Progress
@@ -352,7 +351,7 @@ def report(
     path = _write_report(run)
     console.print(f'report  {path}')
     if picture is not None:
-        from continuum_loc.evaluation.pictures import draw
+        from continuum_loc.offline.pictures import draw
 
         with _busy() as status:
             status.update('drawing')
@@ -401,25 +400,27 @@ def evaluate(
     Example: `continuum-loc evaluate table2 --quick --jobs 2`, `continuum-loc evaluate bags my_bags
     --map my_map.npz`
     """
-    from continuum_loc.evaluation.campaign import SCHEDULER
-    from continuum_loc.evaluation.runs import new_run
-    from continuum_loc.evaluation.study import load_study, study_names
+    from continuum_loc.offline.parallel import SCHEDULER
+    from continuum_loc.offline.runs import new_run
 
     if name is None:
+        require_research()
+        from studies import study_names
+
         console.print('studies: ' + ', '.join([*study_names(), 'bags DIR']))
         return
     if name == 'bags' and (folder is None or map_file is None):
         raise typer.BadParameter('bags needs a folder and a map: evaluate bags DIR --map FILE')
     if minutes is not None and name != 'soak':
         raise typer.BadParameter('--minutes goes with soak')
-    run = None if name == 'bags' else load_study(name)
+    run = None if name == 'bags' else _study(name)
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
     SCHEDULER.set(scheduler)
     if run is None:
         claims = _evaluate_bags(folder, robot, map_file, settings, out, jobs)
     elif minutes is not None:
-        from continuum_loc.evaluation.studies.soak import soak
+        from studies.soak import soak
 
         claims = soak(out, 60.0 * minutes, seed)
     else:
@@ -429,6 +430,30 @@ def evaluate(
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _study(name: str) -> Any:
+    require_research()
+    from studies import load_study
+
+    return load_study(name)
+
+
+def require_research() -> None:
+    """
+    Make the studies and benchmarks of the source tree importable.
+
+    Raises StudyError with what to do where only the package was installed.
+    """
+    tree = Path(__file__).parents[1]
+    if not (tree / 'studies' / '__init__.py').is_file():
+        raise StudyError(
+            'studies and benchmarks stand in the source tree, which is not installed with the '
+            'package: clone the repository, `make install` there, and use its .venv/bin/'
+            'continuum-loc'
+        )
+    if str(tree) not in sys.path:
+        sys.path.append(str(tree))
 
 
 def _failed(out: Path, name: str) -> dict[str, str]:
@@ -443,7 +468,7 @@ def _evaluate_bags(
     folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path, jobs: int
 ) -> list[Claim]:
     from continuum_loc.estimator.settings import settings_of
-    from continuum_loc.evaluation.bags import evaluate_bags
+    from continuum_loc.offline.bags import evaluate_bags
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
@@ -472,8 +497,9 @@ def bench(
 
     Example: `continuum-loc bench --quick --only lookup`
     """
-    from continuum_loc.evaluation import bench as benches
-    from continuum_loc.evaluation.runs import new_run
+    require_research()
+    from bench import harness as benches
+    from continuum_loc.offline.runs import new_run
 
     names = benches.bench_names(only)
     if check:  # what would fail after the work fails before it
@@ -571,8 +597,8 @@ def _describe_map(path: Path, prior: Any) -> None:
 
 
 def _write_report(folder: Path) -> Path:
-    from continuum_loc.evaluation.report import context_of, write_report
-    from continuum_loc.evaluation.runs import load_run
+    from continuum_loc.offline.report import context_of, write_report
+    from continuum_loc.offline.runs import load_run
 
     with _busy() as status:
         status.update('writing the report')

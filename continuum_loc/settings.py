@@ -12,16 +12,9 @@ import difflib
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from continuum_loc.errors import SettingsError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 import yaml
-
-
-class SettingsError(ValueError):
-    """
-    A settings file or mapping that cannot be used.
-
-    The message says what, where and what is valid.
-    """
 
 
 class Settings(BaseModel):
@@ -33,6 +26,11 @@ class Settings(BaseModel):
 
 
 S = TypeVar('S', bound=Settings)
+
+
+def live(default: Any, **rest: Any) -> Any:
+    """Describe a field that may change while the node runs."""
+    return Field(default, json_schema_extra={'live': True}, **rest)
 
 
 def load_settings(model: type[S], path: str | Path) -> S:

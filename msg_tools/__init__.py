@@ -6,7 +6,7 @@ Nothing here needs a ROS installation.
 
 from importlib import import_module
 
-_HOMES = {'BagError': 'bag', 'BagWriter': 'bag', 'ConvertError': 'errors', 'read_bag': 'bag'}
+_HOMES = {'BagError': 'bag', 'BagWriter': 'bag', 'MessageError': 'errors', 'read_bag': 'bag'}
 __all__ = list(_HOMES)
 
 

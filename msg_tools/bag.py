@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from continuum_loc.errors import BagError, MessageError
 from continuum_loc.measurements import NANOSECONDS
-from msg_tools.errors import BagError, ConvertError
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.topics import cloud_topic_record, Topic, topic_spec, TOPICS, TRACKER
 
@@ -115,7 +115,7 @@ def read_bag(
     path: str | Path,
     topics: tuple[str, ...] | None = None,
     namespace: str | None = None,
-    on_error: Callable[[str, ConvertError], None] | None = None,
+    on_error: Callable[[str, MessageError], None] | None = None,
 ) -> Iterator[tuple[str, Any]]:
     """
     (relative topic, measurement, truth or record) of a bag, in the order of the log.
@@ -130,7 +130,7 @@ def read_bag(
     for topic, arrival, data in raw_messages(path, topics, namespace):
         try:
             yield topic, _decode(topic, data, arrival)
-        except ConvertError as error:
+        except MessageError as error:
             if on_error is None:
                 raise BagError(
                     f'{path}: {error} (logged at {arrival / NANOSECONDS:.6f} s)'
@@ -240,7 +240,7 @@ def _decode(topic: str, data: bytes, arrival: int) -> Any:
     try:
         message = deserialize(data, type_name)
     except Exception as error:  # rosbags states no closed set of errors for damaged bytes
-        raise ConvertError(
+        raise MessageError(
             'bytes', f'{topic}: not a {type_name} ({type(error).__name__}: {error})'
         ) from None
     return topic_spec(topic).decode(message, arrival, topic)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from msg_tools.errors import ConvertError
+from continuum_loc.errors import MessageError
 from msg_tools.factory import Messages
 import numpy as np
 
@@ -86,7 +86,7 @@ def cloud_array(message: Any, where: str) -> np.ndarray:
     """
     (H, W) structured array viewing the cloud's bytes.
 
-    Raises ConvertError starting with `where`.
+    Raises MessageError starting with `where`.
     """
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     _check_size(message, where)
@@ -112,17 +112,17 @@ def cloud_dtype(message: Any, where: str) -> np.dtype:
 def _check_size(message: Any, where: str) -> None:
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     if height * width == 0:
-        raise ConvertError(
+        raise MessageError(
             'empty', f'{where}: the cloud is empty (height {height}, width {width})'
         )
     if step == 0 or int(message.row_step) < step * width:
-        raise ConvertError(
+        raise MessageError(
             'size',
             f'{where}: row_step {message.row_step} must be at least width x point_step = '
             f'{width} x {step}, and point_step greater than 0',
         )
     if len(message.data) != height * int(message.row_step):
-        raise ConvertError(
+        raise MessageError(
             'size',
             f'{where}: data holds {len(message.data)} bytes; height x row_step = '
             f'{height} x {message.row_step} asks for {height * int(message.row_step)}',
@@ -131,17 +131,17 @@ def _check_size(message: Any, where: str) -> None:
 
 def _check_field(item: Any, step: int, taken: list[str], where: str) -> None:
     if item.datatype not in DATATYPES:
-        raise ConvertError(
+        raise MessageError(
             'type', f"{where}: field '{item.name}' has datatype {item.datatype}; valid: 1 to 8"
         )
     if item.name in taken:
-        raise ConvertError('fields', f"{where}: field '{item.name}' appears twice")
+        raise MessageError('fields', f"{where}: field '{item.name}' appears twice")
     if item.count not in (0, 1):  # 0 is what some drivers write for a scalar
-        raise ConvertError(
+        raise MessageError(
             'fields', f"{where}: field '{item.name}' has count {item.count}; one value is expected"
         )
     if item.offset + np.dtype(DATATYPES[item.datatype]).itemsize > step:
-        raise ConvertError(
+        raise MessageError(
             'fields',
             f"{where}: field '{item.name}' at offset {item.offset} ends beyond point_step {step}",
         )

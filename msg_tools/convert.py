@@ -13,6 +13,7 @@ from __future__ import annotations
 from math import isqrt
 from typing import Any
 
+from continuum_loc.errors import MessageError
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -27,7 +28,6 @@ from continuum_loc.measurements import (
     TruthSample,
 )
 from msg_tools.clouds import cloud_array, cloud_message, columns_cloud
-from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord, TipRecord
 import numpy as np
@@ -62,10 +62,10 @@ def header_message(make: Messages, stamp: int, frame_id: str) -> Any:
 
 
 def stamp_of(header: Any, where: str) -> int:
-    """Integer nanoseconds of a header. Raises ConvertError where the fields are out of range."""
+    """Integer nanoseconds of a header. Raises MessageError where the fields are out of range."""
     sec, nanosec = int(header.stamp.sec), int(header.stamp.nanosec)
     if sec < 0 or not 0 <= nanosec < NANOSECONDS:
-        raise ConvertError(
+        raise MessageError(
             'stamp',
             f'{where}: stamp {sec} s {nanosec} ns is not a time; valid: sec >= 0, '
             '0 <= nanosec < 1000000000',
@@ -77,17 +77,17 @@ def frame_of(header: Any, where: str) -> str:
     """
     Return the header's frame without a leading slash (tf1's habit).
 
-    Raises ConvertError where it is empty.
+    Raises MessageError where it is empty.
     """
     frame = header.frame_id.lstrip('/')
     if not frame:
-        raise ConvertError('frame', f'{where}: header.frame_id is empty; it must name the sensor')
+        raise MessageError('frame', f'{where}: header.frame_id is empty; it must name the sensor')
     return frame
 
 
 def _require_map(header: Any, where: str) -> None:
     if header.frame_id.lstrip('/') != MAP:
-        raise ConvertError(
+        raise MessageError(
             'frame', f"{where}: header.frame_id is '{header.frame_id}'; valid: '{MAP}'"
         )
 
@@ -116,7 +116,7 @@ def pose_messages(make: Messages, T: np.ndarray) -> list:
 
 
 def transforms_of(poses: list, where: str) -> np.ndarray:
-    """(N, 4, 4) of geometry_msgs/Pose. Raises ConvertError on what is not a pose."""
+    """(N, 4, 4) of geometry_msgs/Pose. Raises MessageError on what is not a pose."""
     values = np.array(
         [
             (
@@ -135,7 +135,7 @@ def transforms_of(poses: list, where: str) -> np.ndarray:
     _require_finite(values, 'pose', where)
     norms = np.linalg.norm(values[:, 3:], axis=1)
     if (np.abs(norms - 1.0) > 1e-2).any():
-        raise ConvertError(
+        raise MessageError(
             'value',
             f'{where}: a quaternion has norm {norms[np.argmax(np.abs(norms - 1))]:.3g}; '
             'valid: 1 within 0.01',
@@ -157,7 +157,7 @@ def body_covariance(covariance: Any, R: np.ndarray, where: str) -> np.ndarray:
     values = np.asarray(covariance, float).reshape(6, 6)
     _require_finite(values, 'covariance', where)
     if (np.diag(values) < 0.0).any():
-        raise ConvertError('value', f'{where}: the covariance has a negative variance')
+        raise MessageError('value', f'{where}: the covariance has a negative variance')
     turn = np.kron(np.eye(2), R)
     return turn.T @ values @ turn
 
@@ -173,7 +173,7 @@ def _vector_message(make: Messages, value: np.ndarray) -> Any:
 
 def _require_finite(values: np.ndarray, what: str, where: str) -> None:
     if not np.isfinite(values).all():
-        raise ConvertError(
+        raise MessageError(
             'value', f'{where}: {what} holds a value that is not finite: {np.ravel(values)[:8]}'
         )
 
@@ -199,14 +199,14 @@ def tof_frame(message: Any, where: str = 'tof/points') -> TofFrame:
     Read the ToF frame of a PointCloud2 with at least x, y, z.
 
     Absent fields are filled: `range` from the points (nan where there is none), `sigma` with nan,
-    `status` with 5 where a range is finite and 255 elsewhere. Raises ConvertError on another
+    `status` with 5 where a range is finite and 255 elsewhere. Raises MessageError on another
     layout, or where the stated range is not the distance of the point (a driver that put the
     perpendicular distance there).
     """
     array = cloud_array(message, where).reshape(-1)
     missing = [name for name in 'xyz' if name not in array.dtype.names]
     if missing:
-        raise ConvertError(
+        raise MessageError(
             'fields',
             f'{where}: no field {", ".join(missing)}; needed: x, y, z, and if known range, '
             f'sigma, status; got: {", ".join(array.dtype.names) or "none"}',
@@ -244,7 +244,7 @@ def _tof_ranges(array: np.ndarray, points: np.ndarray, where: str) -> np.ndarray
     apart = finite & ~(np.abs(distance - ranges) <= 0.01 + 0.01 * np.abs(ranges))
     if apart.any():
         zone = int(np.argmax(apart))
-        raise ConvertError(
+        raise MessageError(
             'range',
             f"{where}: in {apart.sum()} of {len(ranges)} zones `range` is not the point's "
             f'distance (zone {zone}: range {ranges[zone]:.3f} m, point at {distance[zone]:.3f} m)',
@@ -254,9 +254,9 @@ def _tof_ranges(array: np.ndarray, points: np.ndarray, where: str) -> np.ndarray
 
 def _octets(status: np.ndarray, where: str) -> np.ndarray:
     if status.dtype.kind == 'f' and not np.isfinite(status).all():
-        raise ConvertError('value', f"{where}: field 'status' holds a value that is not finite")
+        raise MessageError('value', f"{where}: field 'status' holds a value that is not finite")
     if ((status < 0) | (status > 255)).any():
-        raise ConvertError(
+        raise MessageError(
             'value',
             f"{where}: field 'status' holds {status.min()} to {status.max()}; valid: 0 to 255",
         )
@@ -296,7 +296,7 @@ def imu_sample(message: Any, where: str = 'imu/data_raw') -> ImuSample:
     A gyro alone (linear_acceleration_covariance[0] = -1) has nan acceleration.
     """
     if message.angular_velocity_covariance[0] == -1.0:
-        raise ConvertError(
+        raise MessageError(
             'value', f'{where}: angular_velocity_covariance[0] = -1 says that there is no gyro'
         )
     rate, force = _vector(message.angular_velocity), _vector(message.linear_acceleration)
@@ -322,7 +322,7 @@ def field_sample(message: Any, where: str = 'imu/mag') -> FieldSample:
     """Read the Hall sample of a MagneticField message."""
     value = _vector(message.magnetic_field)
     if np.isinf(value).any():
-        raise ConvertError(
+        raise MessageError(
             'value',
             f'{where}: magnetic_field {value} is infinite; valid: tesla, nan where saturated',
         )
@@ -363,18 +363,18 @@ def strain_sample(message: Any, arrival: int | None = None, where: str = 'strain
     data = np.array(message.data, float)
     offset = int(message.layout.data_offset)
     if offset not in (0, 1):
-        raise ConvertError(
+        raise MessageError(
             'size',
             f'{where}: layout.data_offset is {offset}; valid: 1 (data[0] is the stamp) or 0',
         )
     labels = tuple(dim.label for dim in message.layout.dim)
     if labels and labels != _STRAIN_LABELS:
-        raise ConvertError(
+        raise MessageError(
             'fields', f'{where}: layout.dim is labelled {labels}; valid: {_STRAIN_LABELS}'
         )
     rows = data[offset:]
     if len(rows) == 0 or len(rows) % 3 or (labels and message.layout.dim[0].size * 3 != len(rows)):
-        raise ConvertError(
+        raise MessageError(
             'size',
             f'{where}: {len(rows)} values after the offset; valid: 3 (s, theta, kappa) for each '
             f'of the {message.layout.dim[0].size if labels else "M"} stations, at least one',
@@ -389,12 +389,12 @@ def strain_sample(message: Any, arrival: int | None = None, where: str = 'strain
 def _strain_stamp(data: np.ndarray, offset: int, arrival: int | None, where: str) -> int:
     if offset == 0:
         if arrival is None:
-            raise ConvertError(
+            raise MessageError(
                 'stamp', f'{where}: data_offset = 0 states no stamp, and no arrival time is known'
             )
         return arrival
     if not 0.0 <= data[0] < 2.0**33:
-        raise ConvertError(
+        raise MessageError(
             'stamp',
             f'{where}: data[0] = {data[0]:.6g} is not a stamp in seconds; valid: 0 to 2^33',
         )
@@ -442,9 +442,9 @@ def encoder_sample(message: Any, where: str = 'joint_states') -> EncoderSample:
     """Read the encoders of a JointState; an empty `position` or `effort` becomes nan."""
     names = tuple(message.name)
     if not names:
-        raise ConvertError('empty', f'{where}: no joint is named')
+        raise MessageError('empty', f'{where}: no joint is named')
     if len(set(names)) != len(names):
-        raise ConvertError('fields', f'{where}: a joint is named twice: {", ".join(names)}')
+        raise MessageError('fields', f'{where}: a joint is named twice: {", ".join(names)}')
     position = _per_joint(message.position, names, 'position', where)
     effort = _per_joint(message.effort, names, 'effort', where)
     return EncoderSample(stamp_of(message.header, where), names, position, effort)
@@ -453,13 +453,13 @@ def encoder_sample(message: Any, where: str = 'joint_states') -> EncoderSample:
 def _per_joint(values: Any, names: tuple[str, ...], what: str, where: str) -> np.ndarray:
     array = np.array(values, float)
     if len(array) not in (0, len(names)):
-        raise ConvertError(
+        raise MessageError(
             'size',
             f'{where}: {len(array)} values of {what} for {len(names)} joints; valid: as many '
             'as names, or none',
         )
     if np.isinf(array).any():
-        raise ConvertError('value', f'{where}: {what} holds an infinite value')
+        raise MessageError('value', f'{where}: {what} holds an infinite value')
     return array if len(array) else np.full(len(names), np.nan)
 
 

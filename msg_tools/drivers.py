@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from continuum_loc.errors import MessageError
 from continuum_loc.measurements import (
     ImuSample,
     StrainSample,
@@ -21,7 +22,6 @@ from continuum_loc.measurements import (
     TofFrame,
 )
 from continuum_loc.robot import TofModel
-from msg_tools.errors import ConvertError
 import numpy as np
 
 USABLE = (TOF_VALID, *TOF_HALF_CONFIDENT)
@@ -44,7 +44,7 @@ def vl53l5cx_frame(
     model: of the robot description. Its `convention` says what the raw distance means: this sensor
     reports the *perpendicular* distance. Its `flip_rows`, `flip_columns` undo the lens. stamp: ns
     of the exposure. A zone without a target becomes +inf, one with another status than 5, 6 or 9
-    nan: its distance means nothing. Raises ConvertError where the arrays do not fit the model's
+    nan: its distance means nothing. Raises MessageError where the arrays do not fit the model's
     grid.
     """
     rays = model.directions
@@ -108,13 +108,13 @@ def fbg_sample(
         np.radians(np.asarray(core_azimuth_deg, float)),
     )
     if len(azimuth) < 3 or strains.shape != (len(s), len(azimuth)):
-        raise ConvertError(
+        raise MessageError(
             'size',
             f'fbg: strains of shape {strains.shape} for {len(s)} stations and {len(azimuth)} '
             'cores; valid: stations x cores, at least 3 cores',
         )
     if not np.isfinite(strains).all():
-        raise ConvertError('value', 'fbg: a strain is not finite')
+        raise MessageError('value', 'fbg: a strain is not finite')
     cores = np.column_stack(
         [-core_radius * np.cos(azimuth), -core_radius * np.sin(azimuth), np.ones(len(azimuth))]
     )
@@ -125,5 +125,5 @@ def fbg_sample(
 def _per_zone(values: Any, name: str, count: int) -> np.ndarray:
     array = np.asarray(values, float).reshape(-1)
     if len(array) != count:
-        raise ConvertError('size', f'{name}: {len(array)} values; valid: {count}')
+        raise MessageError('size', f'{name}: {len(array)} values; valid: {count}')
     return array

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from continuum_loc.errors import MessageError
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -16,7 +17,6 @@ from continuum_loc.measurements import (
     TruthSample,
 )
 from msg_tools import convert
-from msg_tools.errors import ConvertError
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, PosesRecord, TipRecord
 
@@ -152,11 +152,11 @@ _SAMPLE_TOPICS = {
 
 
 def topic_of(sample: Any) -> str:
-    """Name the topic that carries a sample. Raises ConvertError for what is none."""
+    """Name the topic that carries a sample. Raises MessageError for what is none."""
     if isinstance(sample, TrackedPose):
         return TRACKER + sample.sensor
     if type(sample) not in _SAMPLE_TOPICS:
-        raise ConvertError('topic', f'no topic of the contract carries a {type(sample).__name__}')
+        raise MessageError('topic', f'no topic of the contract carries a {type(sample).__name__}')
     return _SAMPLE_TOPICS[type(sample)]
 
 
@@ -164,11 +164,11 @@ def topic_spec(name: str) -> Topic:
     """
     Return the contract of a relative topic; `tracker/<sensor>` too.
 
-    Raises ConvertError listing the valid names.
+    Raises MessageError listing the valid names.
     """
     key = TRACKER if name.startswith(TRACKER) else name
     if key not in TOPICS or name == TRACKER:
-        raise ConvertError(
+        raise MessageError(
             'topic',
             f"no topic '{name}' in the contract; valid: "
             + ', '.join('tracker/<sensor>' if topic == TRACKER else topic for topic in TOPICS),

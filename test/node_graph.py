@@ -20,8 +20,8 @@ from continuum_loc.measurements import (
     StrainSample,
     TofFrame,
 )
-from continuum_loc.nodes.domain import Domain
-from continuum_loc.nodes.runtime import output_qos
+from continuum_loc.nodes.support.runtime import output_qos
+from continuum_loc.offline.domain import Domain
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.topics import topic_spec

@@ -5,7 +5,7 @@ Samples of it, and an estimator with known errors.
 """
 
 from continuum_loc import lie
-from continuum_loc.estimator.estimate import Estimate
+from continuum_loc.estimate import Estimate
 from continuum_loc.measurements import ImuSample, NANOSECONDS, TOF_VALID, TofFrame, TruthSample
 from continuum_loc.robot import load_robot, RobotDescription
 import numpy as np

@@ -8,12 +8,11 @@ no bag behind.
 from functools import cache
 import logging
 
-from continuum_loc.evaluation.trials import Trial, world, write_bag
+from continuum_loc.errors import SceneError, SettingsError, SimulationDiverged
+from continuum_loc.offline.trials import Trial, world, write_bag
 from continuum_loc.robot import load_robot, RobotDescription
-from continuum_loc.settings import load_settings, parse_settings, SettingsError
-from continuum_loc.simulator.model import SimulationDiverged
+from continuum_loc.settings import load_settings, parse_settings
 from continuum_loc.simulator.plant import load_plant, PlantSettings
-from continuum_loc.simulator.scene import SceneError
 from continuum_loc.simulator.scenes import load_scene
 from continuum_loc.simulator.world import World
 from hypothesis import given, settings

@@ -7,6 +7,7 @@ Damaged and foreign bags are named.
 import re
 
 from continuum_loc import lie
+from continuum_loc.errors import BagError, MessageError
 from continuum_loc.measurements import (
     FieldSample,
     ImuSample,
@@ -18,7 +19,6 @@ from continuum_loc.measurements import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msg_tools.bag import BagWriter, open_bag, read_bag, split_topic
-from msg_tools.errors import BagError, ConvertError
 from msg_tools.factory import typestore
 from msg_tools.records import CloudRecord, PathRecord, PosesRecord
 from msg_tools.topics import TOPICS, TRACKER
@@ -151,7 +151,7 @@ def test_a_bad_message_is_named_or_handed_to_the_caller(tmp_path):
         BagError, match='imu/data_raw: not a sensor_msgs/msg/Imu.*logged at 0.000000 s'
     ):
         list(read_bag(tmp_path / 'b'))
-    errors: list[ConvertError] = []
+    errors: list[MessageError] = []
     kept = list(read_bag(tmp_path / 'b', on_error=lambda topic, error: errors.append(error)))
     assert [item.stamp for _, item in kept] == [1, 3]
     assert [error.kind for error in errors] == ['bytes']
@@ -204,7 +204,7 @@ def test_a_bag_is_not_overwritten_and_foreign_topics_are_not_written(bag):
         BagWriter(bag)
     with (
         BagWriter(bag.parent / 'new') as writer,
-        pytest.raises(ConvertError, match="no topic 'nowhere'"),
+        pytest.raises(MessageError, match="no topic 'nowhere'"),
     ):
         writer.write('nowhere', _imu(1))
 

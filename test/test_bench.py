@@ -4,10 +4,10 @@ Benchmarks keep up with the code that they measure.
 They run without their peers here, which only `continuum-loc bench` installs.
 """
 
+from bench.harness import bench_names, load_benchmark, require_places
 from continuum_loc import lie
 from continuum_loc.estimator.settings import load_estimator_settings
-from continuum_loc.evaluation.bench import bench_names, load_benchmark, require_places
-from continuum_loc.evaluation.trials import measured, simulate, Trial, write_bag
+from continuum_loc.offline.trials import measured, simulate, Trial, write_bag
 from msg_tools.bag import read_bag
 import numpy as np
 import pytest

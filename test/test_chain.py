@@ -4,6 +4,7 @@ Test the chain against dense algebra.
 Solution, covariances, and marginalisation equal to the batch.
 """
 
+from continuum_loc.errors import SingularError
 from continuum_loc.estimator.chain import (
     BLOCK,
     Blocks,
@@ -11,7 +12,6 @@ from continuum_loc.estimator.chain import (
     Cholesky,
     half_square,
     Message,
-    SingularError,
     symmetric,
 )
 import numpy as np

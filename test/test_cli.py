@@ -8,17 +8,17 @@ import json
 import subprocess
 import sys
 
-from continuum_loc.evaluation.study import (
+from continuum_loc.errors import StudyError
+from continuum_loc.offline.claims import (
     at_least,
     at_most,
     between,
     Claim,
-    load_study,
     plain,
-    StudyError,
     write_study,
 )
 import pytest
+from studies import load_study
 
 
 def run(*arguments, cwd):

@@ -1,11 +1,11 @@
 """Raw fields of real drivers: the geometry of the sensor, and what a status means."""
 
+from continuum_loc.errors import MessageError
 from continuum_loc.robot import TofModel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msg_tools.convert import tof_frame, tof_message
 from msg_tools.drivers import fbg_sample, ism330_sample, vl53l5cx_frame
-from msg_tools.errors import ConvertError
 from msg_tools.factory import bag_messages
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_status_decides_what_a_distance_means():
 
 
 def test_arrays_must_fit_the_grid():
-    with pytest.raises(ConvertError, match='distance_mm: 16 values; valid: 64'):
+    with pytest.raises(MessageError, match='distance_mm: 16 values; valid: 64'):
         vl53l5cx_frame(VL53L5CX, 'a', 1, [1] * 16, [5] * 64)
 
 

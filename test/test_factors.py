@@ -5,9 +5,10 @@ Over random states.
 """
 
 from continuum_loc import lie
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.estimator.chain import Blocks, symmetric
-from continuum_loc.estimator.factors import FACTORS, MeasurementError, TofFactor
+from continuum_loc.estimator.factors import FACTORS, TofFactor
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import column_at_rest, Grid
 from continuum_loc.mapping.voxel_index import VoxelIndex

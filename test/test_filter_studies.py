@@ -8,12 +8,22 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
+from continuum_loc.errors import SettingsError, StudyError
 from continuum_loc.estimator import EstimatorSettings, load_estimator_settings, SlidingWindowFilter
-from continuum_loc.evaluation.metrics import DOF, Errors, errors
-from continuum_loc.evaluation.replay import replay
-from continuum_loc.evaluation.split import HOLD_OUT, require_unseen, SplitError
-from continuum_loc.evaluation.studies import _filter_runs, ablation, consistency, faults
-from continuum_loc.evaluation.studies._filter_runs import (
+from continuum_loc.measurements import NANOSECONDS, TofFrame
+from continuum_loc.offline.metrics import DOF, Errors, errors
+from continuum_loc.offline.replay import replay
+from continuum_loc.offline.trials import Trial
+from continuum_loc.robot import load_robot
+from continuum_loc.settings import parse_settings
+from continuum_loc.simulator.faults import Dropout, Freeze
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from studies import _filter_runs, ablation, consistency, faults
+from studies._filter_runs import (
     Case,
     case_samples,
     case_settings,
@@ -25,16 +35,7 @@ from continuum_loc.evaluation.studies._filter_runs import (
     settled_since,
     Witness,
 )
-from continuum_loc.evaluation.trials import Trial
-from continuum_loc.measurements import NANOSECONDS, TofFrame
-from continuum_loc.robot import load_robot
-from continuum_loc.settings import parse_settings, SettingsError
-from continuum_loc.simulator.faults import Dropout, Freeze
-from hypothesis import given
-from hypothesis import strategies as st
-import numpy as np
-import pytest
-from scipy.stats import chi2
+from studies.support.split import HOLD_OUT, require_unseen
 from synthetic import NoisyFilter, samples, START
 from worlds import Rod, rod, room_map, stream
 
@@ -183,7 +184,7 @@ def test_no_study_rests_on_the_hold_out_and_no_two_cases_share_a_folder(quick):
     )
     require_unseen([case.trial for case in cases] + consistency.trials(quick, 0))
     assert len({case.folder for case in cases}) == len(cases)
-    with pytest.raises(SplitError):
+    with pytest.raises(StudyError):
         require_unseen([HOLD_OUT['engine']])
 
 

@@ -7,8 +7,8 @@ from continuum_loc.estimator.clocks import ClockEvidence
 from continuum_loc.estimator.factors.gyro import judge
 from continuum_loc.estimator.output import rattle_covariance
 from continuum_loc.estimator.state import Grid
-from continuum_loc.evaluation.trials import _base_drawn
 from continuum_loc.measurements import TruthSample
+from continuum_loc.offline.trials import _base_drawn
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.faults import ClockOffset, Outliers

@@ -1,6 +1,6 @@
 """The index is exact against brute force and SciPy, for any cloud, query and cache."""
 
-from continuum_loc.mapping.errors import MapError
+from continuum_loc.errors import MapError
 from continuum_loc.mapping.facing import PATIENCE
 from continuum_loc.mapping.voxel_index import VoxelIndex
 from hypothesis import given, settings

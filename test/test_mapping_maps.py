@@ -4,8 +4,8 @@ Maps: sampling is blue noise with exact normals, and files lose nothing.
 Planarity is what the paper defines.
 """
 
+from continuum_loc.errors import MapError
 from continuum_loc.mapping.build import DENSITY, local_shape, map_from_cloud, sample_mesh
-from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.mapping.prior_map import PriorMap
 from hypothesis import given, settings

@@ -7,7 +7,11 @@ Covariance against Monte Carlo, detection in rooms whose differences are known.
 from dataclasses import replace
 
 from continuum_loc import lie
-from continuum_loc.mapping.anomalies import (
+from continuum_loc.errors import MapError
+from continuum_loc.mapping.build import sample_mesh
+from continuum_loc.measurements import TofFrame
+from continuum_loc.robot import load_robot
+from continuum_loc.scene.anomalies import (
     AnomalyCluster,
     AnomalySettings,
     Beams,
@@ -22,20 +26,16 @@ from continuum_loc.mapping.anomalies import (
     unexplained_share,
     wilson_lower_bound,
 )
-from continuum_loc.mapping.build import sample_mesh
-from continuum_loc.mapping.errors import MapError
-from continuum_loc.mapping.free_space import passes
-from continuum_loc.mapping.fuse import fuse
-from continuum_loc.mapping.reconstruct import (
+from continuum_loc.scene.free_space import passes
+from continuum_loc.scene.fuse import fuse
+from continuum_loc.scene.reconstruct import (
     distances_to_mesh,
     reconstruct,
     Reconstruction,
-    RingTrajectory,
     root_mean_square,
 )
-from continuum_loc.mapping.splat_cast import first_crossings
-from continuum_loc.measurements import TofFrame
-from continuum_loc.robot import load_robot
+from continuum_loc.scene.splat_cast import first_crossings
+from continuum_loc.trajectory import BASE, Trajectory
 import numpy as np
 import pytest
 from scipy import stats
@@ -59,6 +59,8 @@ def placed(mesh, *centre):
     return mesh
 
 
+NAMES = (BASE, *ROBOT.ring_names)
+
 BALL = placed(trimesh.creation.icosphere(subdivisions=3, radius=0.05), 0.2, 0.1, 0.2)
 CUBE = placed(trimesh.creation.box((0.08, 0.08, 0.12)), -0.22, -0.1, 0.06)
 COMMON = placed(trimesh.creation.box((0.1, 0.1, 0.2)), 0.1, -0.22, 0.1)
@@ -72,7 +74,7 @@ def swaying(covariance=None):
         for i, ds in enumerate(np.diff([0, *ROBOT.ring_arclengths])):
             bend = 0.5 * np.array([np.sin(k / 7), np.cos(k / 9)])
             poses[k, i + 1] = poses[k, i] @ lie.exp(np.array([0.75 * ds, 0, 0, 0, *bend]))
-    return RingTrajectory(np.arange(FRAMES) * PERIOD, poses, covariance)
+    return Trajectory(np.arange(FRAMES) * PERIOD, NAMES, poses, covariance)
 
 
 def measured(trajectory, mesh, seed=0, noise=True):
@@ -133,8 +135,8 @@ def test_covariance_matches_monte_carlo():
     )
     covariance = root @ root.T
     base = swaying()
-    trajectory = RingTrajectory(
-        base.stamps[:2], base.T_map_ring[:2], np.tile(covariance, (2, 4, 1, 1))
+    trajectory = Trajectory(
+        base.stamps[:2], NAMES, base.T_map_ring[:2], np.tile(covariance, (2, 4, 1, 1))
     )
     frame = measured(base, room(), noise=False)[4]
     cloud = reconstruct(ROBOT, [frame], trajectory, floor=0.0, body_margin=-ROBOT.radius)
@@ -187,7 +189,7 @@ def test_zones_that_see_the_robot_itself_are_dropped_and_counted():
 def test_frames_outside_the_trajectory_are_counted_and_strange_ones_refused():
     trajectory = swaying()
     frames = measured(trajectory, room())
-    half = RingTrajectory(trajectory.stamps[:20], trajectory.T_map_ring[:20])
+    half = Trajectory(trajectory.stamps[:20], NAMES, trajectory.T_map_ring[:20])
     assert reconstruct(ROBOT, frames, half).skipped == 20 * len(ROBOT.tof)
     late = TofFrame(
         10**12,

@@ -1,26 +1,20 @@
 """The simulated rod obeys mechanics: statics, stretch, frequency, dissipation, tendons."""
 
-from continuum_loc.evaluation.studies.simulator import first_mode
+from continuum_loc.errors import SettingsError, SimulationDiverged
 from continuum_loc.lie import rotation_error_deg
 from continuum_loc.robot import Ring, RobotDescription
-from continuum_loc.settings import parse_settings, SettingsError
+from continuum_loc.settings import parse_settings
 from continuum_loc.simulator import model as rod_model
-from continuum_loc.simulator.model import (
-    advance,
-    build_model,
-    GRAVITY,
-    settle,
-    SimulationDiverged,
-    uniform_rod,
-)
+from continuum_loc.simulator.model import advance, build_model, GRAVITY, settle, uniform_rod
 from continuum_loc.simulator.plant import load_plant, node_arclengths, PlantSettings
-from continuum_loc.simulator.reference import cosserat_shape, elastica_tip
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 import mujoco
 import numpy as np
 import pytest
+from studies.simulator import first_mode
+from studies.support.cosserat import cosserat_shape, elastica_tip
 
 LENGTH, EI, MASS = 1.0, 0.05, 0.02
 

@@ -5,9 +5,10 @@ And tracks against their files.
 """
 
 from continuum_loc import lie
-from continuum_loc.evaluation.metrics import drift_band, Errors, errors, nees, summarise
-from continuum_loc.evaluation.tracks import associate, load_tum, save_tum, Track, TrackError
+from continuum_loc.errors import TrajectoryError
 from continuum_loc.measurements import NANOSECONDS, TruthSample
+from continuum_loc.offline.metrics import drift_band, Errors, errors, nees, summarise
+from continuum_loc.trajectory import associate, load_tum, save_tum, Trajectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -17,7 +18,7 @@ NAMES = ('base', 'ring1', 'ring2')
 START = 1_700_000_000 * NANOSECONDS + 123_456_789
 
 
-def smooth_truth(count: int = 200, period: float = 0.01) -> Track:
+def smooth_truth(count: int = 200, period: float = 0.01) -> Trajectory:
     """
     Move a body whose rings turn and travel at constant body velocities.
 
@@ -29,16 +30,16 @@ def smooth_truth(count: int = 200, period: float = 0.01) -> Track:
     times = np.arange(count) * period
     T_map_ring = lie.exp(times[:, None, None] * twists)
     T_map_ring[..., 0, 3] += np.array([0.0, 0.3, 0.6])
-    return Track(START + np.round(times * NANOSECONDS).astype(np.int64), NAMES, T_map_ring)
+    return Trajectory(START + np.round(times * NANOSECONDS).astype(np.int64), NAMES, T_map_ring)
 
 
-def noisy(truth: Track, covariance: np.ndarray, seed: int) -> Track:
+def noisy(truth: Trajectory, covariance: np.ndarray, seed: int) -> Trajectory:
     """`truth` perturbed so that xi = Log(T_est^-1 T_true) is N(0, covariance)."""
     draw = np.random.default_rng(seed).multivariate_normal(
         np.zeros(6), covariance, truth.T_map_ring.shape[:2]
     )
     T_est = truth.T_map_ring @ lie.exp(-draw)
-    return Track(
+    return Trajectory(
         truth.stamps, truth.names, T_est, np.broadcast_to(covariance, (*T_est.shape[:2], 6, 6))
     )
 
@@ -85,7 +86,7 @@ def test_known_offset_is_reported_exactly():
     shift[:3, 3] = [0.003, 0.0, 0.004]
     moved = truth.T_map_ring.copy()
     moved[:, 2] = moved[:, 2] @ shift
-    figures = summarise(errors(Track(truth.stamps, NAMES, moved), truth))
+    figures = summarise(errors(Trajectory(truth.stamps, NAMES, moved), truth))
     assert figures['rings']['ring2']['translation_mae_m'] == pytest.approx(0.005, abs=1e-12)
     assert figures['rings']['ring2']['rotation_rmse_deg'] == pytest.approx(2.0, abs=1e-9)
     assert figures['rings']['ring1']['translation_mae_m'] == pytest.approx(0.0, abs=1e-12)
@@ -108,7 +109,7 @@ def test_honest_covariance_gives_unit_nees_and_95_percent_coverage():
 def test_overconfident_covariance_is_told():
     truth, covariance = smooth_truth(2000, 0.001), random_covariance(5)
     estimate = noisy(truth, covariance, seed=6)
-    proud = Track(estimate.stamps, NAMES, estimate.T_map_ring, estimate.covariance / 9.0)
+    proud = Trajectory(estimate.stamps, NAMES, estimate.T_map_ring, estimate.covariance / 9.0)
     figures = summarise(errors(proud, truth))
     assert figures['nees_per_dof'] == pytest.approx(9.0, rel=0.1)
     assert figures['coverage_95'] < 0.35  # P(chi2_6 <= 12.59 / 9) = 0.034
@@ -154,7 +155,7 @@ def test_truth_is_interpolated_along_the_geodesic():
 def test_instants_without_truth_are_left_out():
     truth = smooth_truth(100, 0.01)
     gap = truth.select((np.arange(100) < 20) | (np.arange(100) >= 60))
-    late = Track(truth.stamps + 5 * NANOSECONDS, NAMES, truth.T_map_ring)
+    late = Trajectory(truth.stamps + 5 * NANOSECONDS, NAMES, truth.T_map_ring)
     assert len(associate(late, truth)[0]) == 0
     # The 40 samples inside the gap of 0.41 s go.
     assert len(associate(truth, gap, longest_gap=0.2)[0]) == 60
@@ -163,25 +164,25 @@ def test_instants_without_truth_are_left_out():
 
 def test_bodies_with_other_rings_are_refused():
     truth = smooth_truth()
-    with pytest.raises(TrackError, match='different bodies.*tip'):
-        associate(Track(truth.stamps, ('base', 'ring1', 'tip'), truth.T_map_ring), truth)
+    with pytest.raises(TrajectoryError, match='different bodies.*tip'):
+        associate(Trajectory(truth.stamps, ('base', 'ring1', 'tip'), truth.T_map_ring), truth)
 
 
 def test_stamps_must_increase_and_shapes_must_match():
     truth = smooth_truth(3)
-    with pytest.raises(TrackError, match='increase'):
-        Track(truth.stamps[::-1], NAMES, truth.T_map_ring)
-    with pytest.raises(TrackError, match='T_map_ring has shape'):
-        Track(truth.stamps, NAMES[:2], truth.T_map_ring)
+    with pytest.raises(TrajectoryError, match='increase'):
+        Trajectory(truth.stamps[::-1], NAMES, truth.T_map_ring)
+    with pytest.raises(TrajectoryError, match='T_map_ring has shape'):
+        Trajectory(truth.stamps, NAMES[:2], truth.T_map_ring)
 
 
 def test_truth_samples_are_put_in_order():
     samples = [
         TruthSample(stamp, np.tile(np.eye(4) * 1.0, (3, 1, 1))) for stamp in (30, 10, 20, 10)
     ]
-    assert Track.from_truth(samples, NAMES[1:]).stamps.tolist() == [10, 20, 30]
-    with pytest.raises(TrackError, match='holds 3 poses; this robot has 2: base, ring1'):
-        Track.from_truth(samples, NAMES[1:2])
+    assert Trajectory.from_truth(samples, NAMES[1:]).stamps.tolist() == [10, 20, 30]
+    with pytest.raises(TrajectoryError, match='holds 3 poses; this robot has 2: base, ring1'):
+        Trajectory.from_truth(samples, NAMES[1:2])
 
 
 @given(
@@ -192,7 +193,7 @@ def test_truth_samples_are_put_in_order():
 def test_tum_files_keep_every_nanosecond_and_pose(tmp_path_factory, stamps, seed):
     folder = tmp_path_factory.mktemp('tum')
     poses = lie.exp(np.random.default_rng(seed).normal(size=(len(stamps), 3, 6)))
-    track = Track(np.array(sorted(stamps), np.int64), NAMES, poses)
+    track = Trajectory(np.array(sorted(stamps), np.int64), NAMES, poses)
     save_tum(track, folder, 'estimate')
     back = load_tum(folder, 'estimate', NAMES)
     np.testing.assert_array_equal(back.stamps, track.stamps)
@@ -202,7 +203,7 @@ def test_tum_files_keep_every_nanosecond_and_pose(tmp_path_factory, stamps, seed
 def test_a_broken_tum_file_is_named(tmp_path):
     for name in NAMES:
         (tmp_path / f'truth_{name}.tum').write_text('1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 1\n')
-    with pytest.raises(TrackError, match=r'truth_base\.tum.*8 numbers'):
+    with pytest.raises(TrajectoryError, match=r'truth_base\.tum.*8 numbers'):
         load_tum(tmp_path, 'truth', NAMES)
-    with pytest.raises(TrackError, match=r'nowhere_base\.tum: cannot be read'):
+    with pytest.raises(TrajectoryError, match=r'nowhere_base\.tum: cannot be read'):
         load_tum(tmp_path, 'nowhere', NAMES)

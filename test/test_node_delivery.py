@@ -2,7 +2,7 @@
 
 from itertools import count
 
-from continuum_loc.nodes.delivery import await_listeners, SETTLED_MATCH
+from continuum_loc.nodes.support.delivery import await_listeners, SETTLED_MATCH
 import pytest
 
 

@@ -10,6 +10,7 @@ import threading
 import time
 
 from continuum_loc.estimator import settings_of, SlidingWindowFilter
+from continuum_loc.intake import Early, Inbox, Intake, SACRIFICE, StampGate
 from continuum_loc.measurements import (
     EncoderSample,
     ImuSample,
@@ -18,10 +19,9 @@ from continuum_loc.measurements import (
     TofFrame,
     TrackedPose,
 )
-from continuum_loc.nodes.intake import Early, Inbox, Intake, SACRIFICE, StampGate
-from continuum_loc.nodes.pacing import Paced
-from continuum_loc.nodes.settings import IntakeSettings
-from continuum_loc.nodes.warm_up import rest_samples
+from continuum_loc.nodes.support.pacing import Paced
+from continuum_loc.nodes.support.settings import IntakeSettings
+from continuum_loc.nodes.support.warm_up import rest_samples
 from continuum_loc.robot import load_robot
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.topics import topic_spec
@@ -379,14 +379,14 @@ def _offer(intake, rng, kind, topic, victim, now):
         return intake.accept(topic, topic_spec(topic).encode(bag_messages(), victim), now)
     if kind != 'bytes':
         return intake.accept(topic, _bad(rng, kind, topic, victim), now)
-    from msg_tools.errors import ConvertError
+    from continuum_loc.errors import MessageError
 
     spec = topic_spec(topic)
     data = bytes(typestore().serialize_cdr(spec.encode(bag_messages(), victim), spec.type))
     try:
         deserialize(data[: int(rng.integers(5, max(len(data) // 2, 6)))], spec.type)
     except Exception as error:  # on a graph the middleware refuses such bytes before we see them
-        intake.refuse('bytes', str(ConvertError('bytes', f'{topic}: {error}')))
+        intake.refuse('bytes', str(MessageError('bytes', f'{topic}: {error}')))
         return None
     raise AssertionError('half a message was taken for a whole one')
 

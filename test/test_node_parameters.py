@@ -7,13 +7,13 @@ Files are checked, and the YAML of every node is in step.
 import contextlib
 from pathlib import Path
 
+from continuum_loc.errors import SettingsError
 from continuum_loc.estimator import EstimatorSettings
-from continuum_loc.nodes import parameters
-from continuum_loc.nodes.domain import Domain
-from continuum_loc.nodes.runtime import PackageNode
-from continuum_loc.nodes.settings import EstimatorNodeSettings
-from continuum_loc.nodes.write_config import config_text, NODES
-from continuum_loc.settings import SettingsError
+from continuum_loc.nodes.support import parameters
+from continuum_loc.nodes.support.runtime import PackageNode
+from continuum_loc.nodes.support.settings import EstimatorNodeSettings
+from continuum_loc.nodes.support.write_config import config_text, NODES
+from continuum_loc.offline.domain import Domain
 import pytest
 from rcl_interfaces.msg import ParameterType
 import rclpy
@@ -125,7 +125,7 @@ def test_changes_at_run_time_are_asked_about():
 
 @pytest.mark.parametrize('name', NODES)
 def test_the_yaml_of_every_node_is_in_step_with_its_settings(name):
-    """Else run `python -m continuum_loc.nodes.write_config config`."""
+    """Else run `python -m continuum_loc.nodes.support.write_config config`."""
     text = (CONFIG / f'{name}.yaml').read_text()
     assert text == config_text(name)
     given = yaml.safe_load(text)['/**']['ros__parameters']

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from continuum_loc.estimator.estimate import Estimate
-from continuum_loc.mapping.anomalies import AnomalySettings
+from continuum_loc.estimate import Estimate
 from continuum_loc.mapping.map_files import load_map
-from continuum_loc.nodes.memory import SeenScene
+from continuum_loc.nodes.support.memory import SeenScene
+from continuum_loc.scene.anomalies import AnomalySettings
 from node_graph import BOX, BoxRobot
 import numpy as np
 import pytest

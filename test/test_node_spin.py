@@ -5,9 +5,10 @@ import tempfile
 import threading
 from types import FunctionType
 
-from continuum_loc.nodes.domain import Domain, DomainError, DOMAINS
-from continuum_loc.nodes.runtime import _spin, PackageNode
-from continuum_loc.nodes.settings import RecorderNodeSettings
+from continuum_loc.errors import DomainError
+from continuum_loc.nodes.support.runtime import _spin, PackageNode
+from continuum_loc.nodes.support.settings import RecorderNodeSettings
+from continuum_loc.offline.domain import Domain, DOMAINS
 import pytest
 import rclpy
 from rclpy.context import Context

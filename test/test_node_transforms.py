@@ -5,7 +5,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 from continuum_loc import lie
-from continuum_loc.nodes import transforms
+from continuum_loc.nodes.support import transforms
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 import numpy as np

@@ -4,12 +4,12 @@ import json
 import re
 import shutil
 
+from continuum_loc.errors import BagError, MapError
 from continuum_loc.estimator.settings import settings_of
-from continuum_loc.evaluation import bags
-from continuum_loc.evaluation.bags import bag_trials, BagsError, evaluate_bags
-from continuum_loc.evaluation.trials import scene_map_file, simulate, Trial, write_bag
-from continuum_loc.mapping.errors import MapError
 from continuum_loc.measurements import TruthSample
+from continuum_loc.offline import bags
+from continuum_loc.offline.bags import bag_trials, evaluate_bags
+from continuum_loc.offline.trials import scene_map_file, simulate, Trial, write_bag
 from continuum_loc.robot import load_robot
 import pytest
 
@@ -102,9 +102,9 @@ def test_bags_of_one_name_are_told_apart_and_hidden_ones_passed_by(recordings, t
 
 
 def test_a_folder_or_map_that_is_not_there_ends_it_before_any_work(recordings, tmp_path):
-    with pytest.raises(BagsError, match='no such folder'):
+    with pytest.raises(BagError, match='no such folder'):
         evaluate(tmp_path / 'none', tmp_path / 'out')
-    with pytest.raises(BagsError, match='no bags in it'):
+    with pytest.raises(BagError, match='no bags in it'):
         evaluate(tmp_path, tmp_path / 'out')
     with pytest.raises(MapError, match='no such file'):
         evaluate_bags(

@@ -7,22 +7,22 @@ Skipped where CONTINUUM_LOC_DATA is unset.
 import os
 
 from continuum_loc import lie
+from continuum_loc.errors import BagError
 from continuum_loc.measurements import ImuSample, TrackedPose, TruthSample
 from continuum_loc.robot import load_robot
 from hypothesis import given
 from hypothesis import strategies as st
 from msg_tools.bag import read_bag
-from msg_tools.tendon_robot import (
+import numpy as np
+import pytest
+from studies.support.tendon_robot import (
     import_trial,
     measured_anew,
     R_THEIRS_OURS,
     read_recording,
     STAMP_OF_ZERO,
     T_THEIRS_OURS,
-    TrialError,
 )
-import numpy as np
-import pytest
 
 needs_data = pytest.mark.skipif(
     not os.environ.get('CONTINUUM_LOC_DATA'),
@@ -144,16 +144,16 @@ def test_damaged_files_are_refused_with_their_place(trial, line, replaced, said)
     lines = path.read_text().splitlines()
     lines[line] = replaced
     path.write_text('\n'.join(lines))
-    with pytest.raises(TrialError, match=said) as error:
+    with pytest.raises(BagError, match=said) as error:
         read_recording(trial, ROBOT)
     assert 'aurora0.csv' in str(error.value)
 
 
 def test_what_the_robot_does_not_have_is_named(trial, tmp_path):
     _write(trial / 'gyro_base.csv', 'gyro', 0.05, [(0.0, (0, 0, 0))])
-    with pytest.raises(TrialError, match=r'no gyro at s = 0.05 m; it has some at: 0.233, 0.466'):
+    with pytest.raises(BagError, match=r'no gyro at s = 0.05 m; it has some at: 0.233, 0.466'):
         read_recording(trial, ROBOT)
-    with pytest.raises(TrialError, match='no .csv files'):
+    with pytest.raises(BagError, match='no .csv files'):
         read_recording(tmp_path / 'nowhere', ROBOT)
 
 
@@ -164,7 +164,7 @@ def test_hermite_curves_give_the_published_figures():
 
     Plain Hermite interpolation has the published RMSE, to its last digit.
     """
-    from continuum_loc.evaluation.studies.real import data_folder, HERMITE, hermite_errors, WINDOWS
+    from studies.real import data_folder, HERMITE, hermite_errors, WINDOWS
 
     for name, window in WINDOWS.items():
         logged = read_recording(data_folder() / name, ROBOT, as_logged=True)
@@ -180,7 +180,7 @@ def test_the_smoothed_filter_beats_hermite_and_the_published_filter_inside_the_b
 
     Gyros and bending must help there.
     """
-    from continuum_loc.evaluation.studies.real import run
+    from studies.real import run
 
     inner = [
         claim

@@ -7,14 +7,14 @@ It loses no peak on the way to a picture.
 from dataclasses import replace
 import re
 
-from continuum_loc.evaluation.figures import ceiling, spans, thin
-from continuum_loc.evaluation.metrics import errors
-from continuum_loc.evaluation.replay import replay
-from continuum_loc.evaluation.report import Context, run_page, worst_moments, write_report
-from continuum_loc.evaluation.runs import load_run, new_run, save_run, settled
-from continuum_loc.evaluation.tables import latex, markdown, write_table
-from continuum_loc.evaluation.view import clipped, moments, smooth_backbone, surroundings
 from continuum_loc.measurements import NANOSECONDS
+from continuum_loc.offline.figures import ceiling, spans, thin
+from continuum_loc.offline.metrics import errors
+from continuum_loc.offline.replay import replay
+from continuum_loc.offline.report import Context, run_page, worst_moments, write_report
+from continuum_loc.offline.runs import load_run, new_run, save_run, settled
+from continuum_loc.offline.tables import latex, markdown, write_table
+from continuum_loc.offline.view import clipped, moments, smooth_backbone, surroundings
 from continuum_loc.robot import load_robot
 from hypothesis import given, settings
 from hypothesis import strategies as st

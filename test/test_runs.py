@@ -5,18 +5,12 @@ import json
 import multiprocessing
 
 from continuum_loc import lie
-from continuum_loc.evaluation.replay import place_points, replay
-from continuum_loc.evaluation.runs import (
-    distribution,
-    load_run,
-    new_run,
-    RunError,
-    save_run,
-    summary_of,
-)
-from continuum_loc.evaluation.tracks import Track
+from continuum_loc.errors import RunError
 from continuum_loc.measurements import NANOSECONDS, TofFrame
+from continuum_loc.offline.replay import place_points, replay
+from continuum_loc.offline.runs import distribution, load_run, new_run, save_run, summary_of
 from continuum_loc.robot import load_robot
+from continuum_loc.trajectory import Trajectory
 from evo import main_ape
 from evo.core.metrics import PoseRelation
 from evo.core.sync import associate_trajectories
@@ -88,7 +82,7 @@ def test_real_time_factor_is_data_time_over_processing_time(result):
 
 def test_points_are_placed_by_the_pose_of_their_ring_at_their_stamp():
     stamps = START + np.arange(3) * NANOSECONDS // 10
-    track = Track(
+    track = Trajectory(
         stamps, ('base', *ROBOT.ring_names), np.stack([truth_at(ROBOT, stamp) for stamp in stamps])
     )
     sensor, stamp = ROBOT.tof[7], int(stamps[0] + NANOSECONDS // 20)

@@ -4,18 +4,19 @@ Scenes: closed, of the stated size, with free way for the robot.
 And with exact truth of their anomalies.
 """
 
-from continuum_loc.evaluation.studies._pieces import standing_out
+from continuum_loc.errors import SceneError
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator import convex, cutting, mesh_import, scene_cache
 from continuum_loc.simulator.mesh_import import check_mesh
 from continuum_loc.simulator.raycast import RayCaster
-from continuum_loc.simulator.scene import Anomaly, Scene, SceneError
+from continuum_loc.simulator.scene import Anomaly, Scene
 from continuum_loc.simulator.scenes import load_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
+from studies._pieces import standing_out
 import trimesh
 
 VARIANTS = ('S2', 'S5', 'S9')  # one of each kind: added objects, missing features, both

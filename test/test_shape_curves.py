@@ -7,12 +7,12 @@ And straight without failing.
 from continuum_loc import lie
 from continuum_loc.robot import load_robot
 from continuum_loc.shape import curves
-from continuum_loc.shape.paper import printed_quadratic_bezier
-from continuum_loc.shape.simulate import Arm, bent, out_of_plane, PERFECT, s_shape
+from continuum_loc.simulator.hall_arm import Arm, bent, out_of_plane, PERFECT, s_shape
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from studies.support.shape_paper import printed_quadratic_bezier
 
 ROBOT = load_robot('hall_arm')
 ARM = Arm(ROBOT, PERFECT)

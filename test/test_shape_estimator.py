@@ -3,23 +3,22 @@
 from dataclasses import replace
 
 from continuum_loc import lie
+from continuum_loc.errors import CalibrationError, MotionError, SettingsError
+from continuum_loc.magnet import ring_field
 from continuum_loc.measurements import FieldSample, ImuSample, NANOSECONDS, seconds, StrainSample
 from continuum_loc.robot import load_robot
-from continuum_loc.settings import dump_settings, parse_settings, SettingsError
+from continuum_loc.settings import dump_settings, parse_settings
 from continuum_loc.shape import curves, load_shape_settings, ShapeEstimator, ShapeSettings
 from continuum_loc.shape.backbone import _forward, BackboneSolver, PIECES
 from continuum_loc.shape.calibration import (
     calibrate,
     Calibration,
-    CalibrationError,
     load_calibration,
     module_mounts,
     nominal_calibration,
 )
-from continuum_loc.shape.magnet import ring_field
-from continuum_loc.shape.paper import Background, MENDS, paper_pipeline
-from continuum_loc.shape.rest import MotionError, RestWindow
-from continuum_loc.shape.simulate import (
+from continuum_loc.shape.rest import RestWindow
+from continuum_loc.simulator.hall_arm import (
     Arm,
     bent,
     groove_motion,
@@ -31,6 +30,7 @@ from continuum_loc.shape.simulate import (
 )
 import numpy as np
 import pytest
+from studies.support.shape_paper import Background, MENDS, paper_pipeline
 
 ROBOT = load_robot('hall_arm')
 S = np.array([0.025, 0.050, 0.075])
@@ -351,7 +351,7 @@ def test_silent_from_the_start_is_refused_by_name(recording):
 
 
 def test_every_fault_is_told_for_what_it_is():
-    from continuum_loc.evaluation.studies._shape_faults import fault_rows
+    from studies._shape_faults import fault_rows
 
     wrong = [(row['fault'], row['told']) for row in fault_rows(ROBOT, 4) if not row['right']]
     assert not wrong

@@ -3,9 +3,9 @@
 import subprocess
 import sys
 
-from continuum_loc.evaluation import source
-from continuum_loc.evaluation.replay import replay
-from continuum_loc.evaluation.trials import (
+from continuum_loc.offline import source
+from continuum_loc.offline.replay import replay
+from continuum_loc.offline.trials import (
     make_filter,
     scene_map,
     simulate,
@@ -22,7 +22,7 @@ CODE = 'def f(x):\n    return x + 1\n'
 LOADED = """
 import sys
 from pathlib import Path
-from continuum_loc.evaluation.trials import Trial, {what}
+from continuum_loc.offline.trials import Trial, {what}
 trial = Trial('soft_arm', 'R0', 'b1', 'R0', fidelity='vl53l5cx', disturbed=True, duration=0.4)
 {work}
 for name, module in sys.modules.items():

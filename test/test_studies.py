@@ -9,10 +9,7 @@ import json
 import math
 import shutil
 
-from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.evaluation import campaign
-from continuum_loc.evaluation.bench import (
-    BenchError,
+from bench.harness import (
     BenchOutcome,
     bound_claims,
     duration,
@@ -22,16 +19,19 @@ from continuum_loc.evaluation.bench import (
     write_baseline,
     write_document,
 )
-from continuum_loc.evaluation.campaign import Outcome, run_campaign
-from continuum_loc.evaluation.error_tables import condition_table, figures, mean, trial_rows
-from continuum_loc.evaluation.split import HOLD_OUT, is_hold_out, require_unseen, SplitError
-from continuum_loc.evaluation.studies import table2, table3
-from continuum_loc.evaluation.studies._soft_arm import soft_arm_trials
-from continuum_loc.evaluation.trials import Trial
-from continuum_loc.evaluation.tune import cost, scaled, TuneError
-from continuum_loc.settings import SettingsError
+from continuum_loc.errors import SettingsError, StudyError, TuneError
+from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.offline import parallel
+from continuum_loc.offline.error_tables import condition_table, figures, mean, trial_rows
+from continuum_loc.offline.trials import Trial
+from continuum_loc.offline.tune import cost, scaled
 import numpy as np
 import pytest
+from studies import table2, table3
+from studies._soft_arm import soft_arm_trials
+from studies.support import campaign
+from studies.support.campaign import Outcome, run_campaign
+from studies.support.split import HOLD_OUT, is_hold_out, require_unseen
 
 
 def outcome(trial, translation=0.001, rotation=0.1, silent=0.0):
@@ -78,7 +78,7 @@ def test_trials_that_differ_in_the_map_alone_share_one_bag(done):
 def test_an_interrupted_campaign_continues(done, monkeypatch):
     out, trials, before = done
     # A repeated estimation would fail.
-    monkeypatch.setattr('continuum_loc.evaluation.replay.replay', None)
+    monkeypatch.setattr('continuum_loc.offline.replay.replay', None)
     again = run_campaign(trials[:2], out, jobs=1)
     assert [one.summary['digest'] for one in again] == [
         one.summary['digest'] for one in before[:2]
@@ -132,11 +132,11 @@ def test_a_dask_cluster_gives_what_one_process_gives(done, tmp_path):
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address=None
     ) as cluster:
-        token = campaign.SCHEDULER.set(cluster.scheduler_address)
+        token = parallel.SCHEDULER.set(cluster.scheduler_address)
         try:
             again = run_campaign(trials[:2], tmp_path)
         finally:
-            campaign.SCHEDULER.reset(token)
+            parallel.SCHEDULER.reset(token)
     assert [one.summary['digest'] for one in again] == [
         one.summary['digest'] for one in before[:2]
     ]
@@ -145,15 +145,13 @@ def test_a_dask_cluster_gives_what_one_process_gives(done, tmp_path):
 def test_a_scheduler_that_is_not_there_is_named(done, tmp_path, monkeypatch):
     pytest.importorskip('distributed', reason='Dask is an optional extra')
     _, trials, _ = done
-    monkeypatch.setattr(campaign, 'CONNECT_LIMIT', 1)
-    token = campaign.SCHEDULER.set('tcp://127.0.0.1:1')
+    monkeypatch.setattr(parallel, 'CONNECT_LIMIT', 1)
+    token = parallel.SCHEDULER.set('tcp://127.0.0.1:1')
     try:
-        with pytest.raises(
-            campaign.CampaignError, match=r'no Dask scheduler at tcp://127\.0\.0\.1:1'
-        ):
+        with pytest.raises(StudyError, match=r'no Dask scheduler at tcp://127\.0\.0\.1:1'):
             run_campaign(trials[:1], tmp_path)
     finally:
-        campaign.SCHEDULER.reset(token)
+        parallel.SCHEDULER.reset(token)
 
 
 def test_a_failure_while_estimating_leaves_its_traceback(done, monkeypatch, tmp_path):
@@ -179,7 +177,7 @@ def test_the_soft_arm_campaign_is_the_papers():
 def test_no_claim_rests_on_the_hold_out():
     held = replace(HOLD_OUT['engine'], seed=0)
     assert is_hold_out(held)
-    with pytest.raises(SplitError, match='tuned on'):
+    with pytest.raises(StudyError, match='tuned on'):
         require_unseen([held])
     # The hold-out is far off here; the claim of S0 must not see it.
     outcomes = [
@@ -249,13 +247,13 @@ def test_regressions_are_falls_beyond_slack_and_spread(tmp_path):
     assert not regressions(row(ratio=2.6, spread=(2.5, 2.7)))  # within the slack
     assert not regressions(row(ratio=1.5, spread=(0.5, 3.0)))  # too noisy to tell
     assert not regressions(row(name='new', ratio=0.1, spread=(0.1, 0.1)))
-    with pytest.raises(BenchError, match='no baseline'):
+    with pytest.raises(StudyError, match='no baseline'):
         BenchOutcome([], [], []).regressions(tmp_path / 'nothing.json')
 
 
 def test_what_has_become_slower_shows_whatever_the_machine_does_meanwhile(tmp_path, monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr('continuum_loc.evaluation.bench.process_time', lambda: clock[0])
+    monkeypatch.setattr('bench.harness.process_time', lambda: clock[0])
     noise = np.random.default_rng(0)
 
     def lasting(seconds):
@@ -292,12 +290,12 @@ def test_the_document_takes_each_table_between_its_markers(tmp_path):
     assert 'old' not in text and text.startswith('Before\n') and text.endswith('after\n')
     assert '| lookup | 1 us | them | 3 us | 3 | 2.8 to 3.2 |' in text
     assert 'memory' not in text  # nobody has any
-    with pytest.raises(BenchError, match='bench b'):
+    with pytest.raises(StudyError, match='bench b'):
         write_document([row() | {'benchmark': 'b'}], document)
 
 
 def test_one_broken_benchmark_does_not_stop_the_others(tmp_path, monkeypatch):
-    monkeypatch.setattr('continuum_loc.evaluation.bench.BENCH_FOLDER', tmp_path)
+    monkeypatch.setattr('bench.harness.BENCH_FOLDER', tmp_path)
     (tmp_path / 'a.py').write_text("def run(quick): raise OSError('no peer')")
     (tmp_path / 'b.py').write_text(
         f"BOUNDS = [('look', 'ratio', 'at least', 5.0)]\ndef run(quick): return [{row()!r}]"
@@ -310,7 +308,7 @@ def test_one_broken_benchmark_does_not_stop_the_others(tmp_path, monkeypatch):
         json.loads((tmp_path / 'out' / 'summary.json').read_text())['failures'] == found.failures
     )
     assert '| lookup |' in (tmp_path / 'out' / 'bench.md').read_text()
-    with pytest.raises(BenchError, match='benchmarks: a, b'):
+    with pytest.raises(StudyError, match='benchmarks: a, b'):
         run_bench(tmp_path / 'out', quick=True, only='c')
 
 

@@ -452,7 +452,7 @@ def _in_the_box(yaw: float = 0.0) -> np.ndarray:
 
 
 def test_the_noise_tests_of_the_study_pass_and_notice_a_wrong_model(monkeypatch):
-    from continuum_loc.evaluation.studies import _vl53l5cx
+    from studies import _vl53l5cx
 
     rows = {row['sensor']: row['p_value'] for row in _vl53l5cx.noise(0)}
     assert len(rows) == 6 and min(rows.values()) > 1e-3

@@ -8,8 +8,8 @@ SCRIPT = """
 import sys
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
-from continuum_loc.nodes.memory import SeenScene
-from continuum_loc.nodes.warm_up import warm_up
+from continuum_loc.nodes.support.memory import SeenScene
+from continuum_loc.nodes.support.warm_up import warm_up
 from continuum_loc.settings import parse_settings
 from numba.core.dispatcher import Dispatcher
 from worlds import Rod, rod, room_map, stream

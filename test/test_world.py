@@ -14,6 +14,7 @@ import subprocess
 import sys
 
 from continuum_loc import lie
+from continuum_loc.errors import SettingsError
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -26,13 +27,12 @@ from continuum_loc.measurements import (
     TruthSample,
 )
 from continuum_loc.robot import load_robot, Sensor
-from continuum_loc.settings import SettingsError
 from continuum_loc.simulator import faults
 from continuum_loc.simulator.model import GRAVITY
 from continuum_loc.simulator.motion import backbone, Motion, State
 from continuum_loc.simulator.plant import load_plant
 from continuum_loc.simulator.sensors import HallSensors, ImuSensors, StrainSensor
-from continuum_loc.simulator.trajectories import Trajectory, trajectory, trajectory_names
+from continuum_loc.simulator.trajectories import Drive, trajectory, trajectory_names
 from continuum_loc.simulator.world import World
 import numpy as np
 import pytest
@@ -429,7 +429,7 @@ def test_tracked_poses_are_as_uncertain_as_they_say():
 
 
 def test_the_hall_arm_reads_the_ring_magnet_and_the_earth():
-    from continuum_loc.shape.magnet import ring_field
+    from continuum_loc.magnet import ring_field
 
     robot = quiet(load_robot('hall_arm'))
     world = World(robot, None, 'straight')
@@ -601,12 +601,12 @@ def test_a_trajectory_of_ones_own_is_read_from_yaml(tmp_path):
 def test_a_trajectory_for_other_drives_is_refused():
     times = np.array([1.0, 2.0])
     with pytest.raises(SettingsError, match='drives 4 tendons, the plant has 9'):
-        World(load_robot('engine'), None, Trajectory('mine', times, np.ones((2, 4)), np.zeros(2)))
+        World(load_robot('engine'), None, Drive('mine', times, np.ones((2, 4)), np.zeros(2)))
     with pytest.raises(SettingsError, match='can travel 0.0 to 0.6 m'):
         World(
             load_robot('engine'),
             None,
-            Trajectory('mine', times, np.ones((2, 9)), np.array([0.0, 0.9])),
+            Drive('mine', times, np.ones((2, 9)), np.array([0.0, 0.9])),
         )
 
 
@@ -620,7 +620,7 @@ def test_a_trajectory_for_other_drives_is_refused():
 )
 def test_impossible_keyframes_are_refused(times, tensions, message):
     with pytest.raises(ValueError, match=message):
-        Trajectory('mine', np.array(times), np.array(tensions), np.zeros(2))
+        Drive('mine', np.array(times), np.array(tensions), np.zeros(2))
 
 
 # --------------------------------------------------------------------------- faults

@@ -3,7 +3,6 @@
 from importlib import import_module
 
 _HOMES = {
-    'Estimate': 'estimate',
     'EstimatorSettings': 'settings',
     'SlidingWindowFilter': 'filter',
     'load_estimator_settings': 'settings',

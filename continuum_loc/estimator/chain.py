@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from continuum_loc.errors import SingularError
 from numba import njit
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -26,17 +27,6 @@ from scipy.linalg import blas, lapack
 
 BLOCK = 54  # rows of a factor that are solved at once: three nodes
 Step = tuple[int, slice]
-
-
-class SingularError(ArithmeticError):
-    """An elimination met a matrix that is not positive definite; `column` says at which one."""
-
-    def __init__(self, column: int):
-        super().__init__(
-            f'the information of column {column} is not positive definite: some of its '
-            'directions are not observed by any measurement or prior'
-        )
-        self.column = column
 
 
 @dataclass(slots=True, eq=False)

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from operator import itemgetter
 import time as clock
 
-from continuum_loc.estimator.chain import SingularError
-from continuum_loc.estimator.estimate import Estimate
-from continuum_loc.estimator.factors import Factor, FACTORS, MeasurementError, TofFactor
+from continuum_loc.errors import MeasurementError, SingularError
+from continuum_loc.estimate import Estimate
+from continuum_loc.estimator.factors import Factor, FACTORS, TofFactor
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.output import backbone, BodyState, rattle_covariance
 from continuum_loc.estimator.priors import Priors

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from continuum_loc import lie
-from continuum_loc.estimator.estimate import Status
+from continuum_loc.estimate import Status
 from continuum_loc.estimator.factors.tof import associate, frame_information, TofFactor
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.priors import Priors

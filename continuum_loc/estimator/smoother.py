@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from continuum_loc.estimator.estimate import Estimate
+from continuum_loc.estimate import Estimate
 from continuum_loc.estimator.filter import SlidingWindowFilter
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.measurements import Measurement

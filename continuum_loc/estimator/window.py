@@ -16,7 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil
 
-from continuum_loc.estimator.chain import Chain, half_square, Message, SingularError
+from continuum_loc.errors import SingularError
+from continuum_loc.estimator.chain import Chain, half_square, Message
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.output import (

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 import warnings
 
+from continuum_loc.errors import MapError
 from continuum_loc.mapping.build import map_from_cloud, sample_mesh
-from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.prior_map import by_suffix, CLOUD_COLUMNS, NPZ_FORMAT, PriorMap
 import numpy as np
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import json
 from pathlib import Path
 
-from continuum_loc.mapping.errors import MapError
+from continuum_loc.errors import MapError
 from continuum_loc.mapping.ply import write_ply
 from continuum_loc.mapping.voxel_index import VoxelIndex
 import numpy as np

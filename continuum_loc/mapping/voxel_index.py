@@ -20,8 +20,8 @@ from __future__ import annotations
 
 from functools import cached_property
 
+from continuum_loc.errors import MapError
 from continuum_loc.mapping.candidates import near_cells, NearCells
-from continuum_loc.mapping.errors import MapError
 from continuum_loc.mapping.facing import COUNTERS, empty_cache, TAKEN_AS_FILLED
 from continuum_loc.mapping.grid import (
     AXIS_LIMIT,

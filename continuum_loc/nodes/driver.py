@@ -18,13 +18,12 @@ import sys
 import threading
 from typing import Any
 
+from continuum_loc.errors import MessageError, SettingsError
 from continuum_loc.measurements import ImuSample, NANOSECONDS, nanoseconds, StrainSample, TofFrame
-from continuum_loc.nodes.runtime import output_qos, PackageNode, run
-from continuum_loc.nodes.settings import DriverNodeSettings
+from continuum_loc.nodes.support.runtime import output_qos, PackageNode, run
+from continuum_loc.nodes.support.settings import DriverNodeSettings
 from continuum_loc.robot import load_robot
-from continuum_loc.settings import SettingsError
 from msg_tools.drivers import fbg_sample, ism330_sample, vl53l5cx_frame
-from msg_tools.errors import ConvertError
 from msg_tools.factory import ros_messages
 from msg_tools.topics import topic_spec
 
@@ -70,7 +69,7 @@ class DriverNode(PackageNode):
         for line in _lines(self._source, self._stop.is_set):
             try:
                 sample = self._sample(line)
-            except ConvertError as error:
+            except MessageError as error:
                 self._refuse(error)
                 continue
             topic = TOPIC_OF[type(sample)]
@@ -78,7 +77,7 @@ class DriverNode(PackageNode):
             self.published[topic] += 1
         self.finish()
 
-    def _refuse(self, error: ConvertError) -> None:
+    def _refuse(self, error: MessageError) -> None:
         self.refused[error.kind] += 1
         if self.refused[error.kind] == 1:
             self.get_logger().warning(
@@ -91,7 +90,7 @@ class DriverNode(PackageNode):
         make = {'distance_mm': self._tof, 'gyro_raw': self._imu, 'strains': self._strain}
         form = next((name for name in FORMS if name in reading), None)
         if form is None:
-            raise ConvertError(
+            raise MessageError(
                 'fields',
                 f'a reading of {", ".join(reading) or "nothing"}; valid: '
                 + '; or '.join(FORMS.values()),
@@ -99,9 +98,9 @@ class DriverNode(PackageNode):
         try:
             sample = make[form](stamp, **reading)
         except (TypeError, ValueError) as error:
-            if isinstance(error, ConvertError):
+            if isinstance(error, MessageError):
                 raise
-            raise ConvertError(
+            raise MessageError(
                 'fields', f'a reading with {form}: {error}; valid: {FORMS[form]}'
             ) from None
         if isinstance(sample, StrainSample):
@@ -115,7 +114,7 @@ class DriverNode(PackageNode):
         try:
             return round(float(given) * NANOSECONDS)
         except (TypeError, ValueError, OverflowError):
-            raise ConvertError('stamp', f'stamp {given!r} is not a number of seconds') from None
+            raise MessageError('stamp', f'stamp {given!r} is not a number of seconds') from None
 
     def _tof(self, stamp: int, sensor: str, **raw: Any) -> TofFrame:
         self._require(sensor, self.robot.tof)
@@ -141,7 +140,7 @@ class DriverNode(PackageNode):
     def _require(self, sensor: str, known: tuple) -> None:
         names = [one.name for one in known]
         if sensor not in names:
-            raise ConvertError(
+            raise MessageError(
                 'unknown frame',
                 f"robot '{self.robot.name}' has no such sensor '{sensor}'; valid: "
                 f'{", ".join(names) or "none of this kind"}',
@@ -182,9 +181,9 @@ def _reading(line: bytes) -> dict[str, Any]:
     try:
         reading = json.loads(line)
     except ValueError as error:
-        raise ConvertError('line', f'not JSON ({error}): {line[:60]!r}') from None
+        raise MessageError('line', f'not JSON ({error}): {line[:60]!r}') from None
     if not isinstance(reading, dict):
-        raise ConvertError('line', f'a {type(reading).__name__}, not an object: {line[:60]!r}')
+        raise MessageError('line', f'a {type(reading).__name__}, not an object: {line[:60]!r}')
     return reading
 
 

@@ -7,21 +7,21 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from continuum_loc.errors import MessageError
+from continuum_loc.estimate import Estimate
 from continuum_loc.estimator import EstimatorSettings, settings_of, SlidingWindowFilter
-from continuum_loc.estimator.estimate import Estimate
 from continuum_loc.estimator.settings import PRESETS_FOLDER
 from continuum_loc.measurements import EncoderSample, Measurement, nanoseconds, TofFrame
-from continuum_loc.nodes import parameters
-from continuum_loc.nodes.memory import SeenScene, Trajectory
-from continuum_loc.nodes.runtime import run
-from continuum_loc.nodes.settings import EstimatorNodeSettings
-from continuum_loc.nodes.transforms import broadcaster
-from continuum_loc.nodes.warm_up import warm_up
-from continuum_loc.nodes.worker import ERROR, OK, WARN, WorkerNode
+from continuum_loc.nodes.support import parameters
+from continuum_loc.nodes.support.memory import RecentPoses, SeenScene
+from continuum_loc.nodes.support.runtime import run
+from continuum_loc.nodes.support.settings import EstimatorNodeSettings
+from continuum_loc.nodes.support.transforms import broadcaster
+from continuum_loc.nodes.support.warm_up import warm_up
+from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import columns_message, map_record, tip_message, tracked_pose
-from msg_tools.errors import ConvertError
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
 from msg_tools.topics import tip_of, TRACKER
@@ -45,7 +45,7 @@ class EstimatorNode(WorkerNode):
         self.prior_map = self._load_map()
         self.filter = self._new_filter(self.robot)
         self.estimate: Estimate | None = None
-        self.trajectory = Trajectory(self.settings.trajectory_seconds)
+        self.recent = RecentPoses(self.settings.trajectory_seconds)
         self.scene = SeenScene(self.robot, self.prior_map, self.settings.reconstruction_seconds)
         self._insertion = 0.0
         self._scene_published = 0
@@ -112,7 +112,7 @@ class EstimatorNode(WorkerNode):
             'latency [ms]': float(1e3 * np.median(self.latency.recent(30)))
             if self.latency.values
             else 'unknown',
-            'rate [Hz]': _rate(self.trajectory),
+            'rate [Hz]': _rate(self.recent),
         }
         if estimate.status == 'lost':
             return ERROR, 'lost', values
@@ -142,7 +142,7 @@ class EstimatorNode(WorkerNode):
         self.publish('backbone', estimate)
         if self.frames is not None and self.settings.publish_tf:
             self.frames.send(estimate.stamp, estimate.T_map_ring)
-        self.trajectory.add(estimate)
+        self.recent.add(estimate)
         smoothed = estimate.lagged if self.filter_settings.lag > 0.0 else estimate
         if smoothed is not None:
             self.scene.follow(smoothed)
@@ -181,9 +181,9 @@ class EstimatorNode(WorkerNode):
         return str(path)
 
     def _save_trajectory(self) -> str:
-        from continuum_loc.evaluation.tracks import save_tum
+        from continuum_loc.trajectory import save_tum
 
-        track = self.trajectory.track(self.robot)
+        track = self.recent.trajectory(self.robot)
         if not len(track):
             raise ValueError('there is no estimate yet')
         save_tum(track, self._output(''), 'estimate')
@@ -198,7 +198,7 @@ class EstimatorNode(WorkerNode):
         """Take the base's present pose, as RViz's tool gives it, and start the estimate anew."""
         try:
             pose = tracked_pose(message, 'base', 'initialpose')
-        except ConvertError as error:
+        except MessageError as error:
             self.intake.refuse(error.kind, str(error))
             return
         robot = with_base(self.robot, pose.T_map_sensor, pose.covariance, self._insertion)
@@ -290,8 +290,8 @@ def _answer(action: Any, request: Trigger.Request, response: Trigger.Response) -
     return response
 
 
-def _rate(trajectory: Trajectory) -> float:
-    stamps = trajectory.recent(16)
+def _rate(poses: RecentPoses) -> float:
+    stamps = poses.recent(16)
     return 1e9 * (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 0.0
 
 

@@ -14,9 +14,9 @@ import sys
 import threading
 from typing import Any
 
-from continuum_loc.nodes.runtime import input_qos, PackageNode, run, write_summary
-from continuum_loc.nodes.settings import RecorderNodeSettings
-from continuum_loc.settings import SettingsError
+from continuum_loc.errors import SettingsError
+from continuum_loc.nodes.support.runtime import input_qos, PackageNode, run, write_summary
+from continuum_loc.nodes.support.settings import RecorderNodeSettings
 from msg_tools.bag import BagWriter, split_topic
 from msg_tools.topics import topic_spec, TOPICS, TRACKER
 from rclpy.qos import DurabilityPolicy

@@ -13,15 +13,14 @@ import sys
 import threading
 from typing import Any
 
+from continuum_loc.errors import BagError, SettingsError
 from continuum_loc.measurements import nanoseconds
-from continuum_loc.nodes.delivery import await_acknowledged, await_listeners
-from continuum_loc.nodes.pacing import Paced
-from continuum_loc.nodes.runtime import output_qos, PackageNode, run
-from continuum_loc.nodes.settings import ReplayerNodeSettings
-from continuum_loc.settings import SettingsError
+from continuum_loc.nodes.support.delivery import await_acknowledged, await_listeners
+from continuum_loc.nodes.support.pacing import Paced
+from continuum_loc.nodes.support.runtime import output_qos, PackageNode, run
+from continuum_loc.nodes.support.settings import ReplayerNodeSettings
 from msg_tools.bag import contract_topics, open_bag, raw_messages
 from msg_tools.convert import time_message
-from msg_tools.errors import BagError
 from msg_tools.factory import ros_messages
 from msg_tools.topics import INPUTS, topic_spec, TOPICS, TRACKER
 from rosgraph_msgs.msg import Clock

@@ -10,12 +10,12 @@ import sys
 from typing import Any
 
 from continuum_loc.measurements import Measurement
-from continuum_loc.nodes.runtime import run
-from continuum_loc.nodes.settings import ShapeNodeSettings
-from continuum_loc.nodes.worker import ERROR, OK, WARN, WorkerNode
+from continuum_loc.nodes.support.runtime import run
+from continuum_loc.nodes.support.settings import ShapeNodeSettings
+from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
 from continuum_loc.shape import load_shape_settings, ShapeEstimate, ShapeEstimator, ShapeSettings
-from continuum_loc.shape.simulate import Arm, Motion
+from continuum_loc.simulator.hall_arm import Arm, Motion
 from msg_tools.records import PathRecord, PosesRecord
 import numpy as np
 from std_srvs.srv import Trigger

@@ -13,10 +13,10 @@ import sys
 import threading
 from typing import Any
 
-from continuum_loc.nodes.delivery import await_acknowledged, await_listeners
-from continuum_loc.nodes.pacing import Paced
-from continuum_loc.nodes.runtime import Delays, output_qos, PackageNode, run, write_summary
-from continuum_loc.nodes.settings import SimulatorNodeSettings
+from continuum_loc.nodes.support.delivery import await_acknowledged, await_listeners
+from continuum_loc.nodes.support.pacing import Paced
+from continuum_loc.nodes.support.runtime import Delays, output_qos, PackageNode, run, write_summary
+from continuum_loc.nodes.support.settings import SimulatorNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord

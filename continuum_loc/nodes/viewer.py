@@ -11,11 +11,10 @@ import sys
 import threading
 from typing import Any
 
-from continuum_loc.mapping.anomalies import AnomalySettings
-from continuum_loc.nodes.runtime import input_qos, PackageNode, run
-from continuum_loc.nodes.settings import ViewerNodeSettings
-from continuum_loc.settings import SettingsError
-from msg_tools.errors import ConvertError
+from continuum_loc.errors import MessageError, SettingsError
+from continuum_loc.nodes.support.runtime import input_qos, PackageNode, run
+from continuum_loc.nodes.support.settings import ViewerNodeSettings
+from continuum_loc.scene.anomalies import AnomalySettings
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord
 from msg_tools.topics import topic_spec
 import numpy as np
@@ -70,7 +69,7 @@ class ViewerNode(PackageNode):
     def _receive(self, topic: str, message: Any) -> None:
         try:
             item = topic_spec(topic).decode(message, None, topic)
-        except ConvertError as error:
+        except MessageError as error:
             self.get_logger().warning(str(error), throttle_duration_sec=10.0)
             return
         if isinstance(item, DiagnosticsRecord):

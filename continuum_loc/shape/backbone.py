@@ -18,8 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from continuum_loc import lie_kernels
+from continuum_loc.magnet import evaluate_field, FieldModel, magnet_parameters
 from continuum_loc.robot import RobotDescription
-from continuum_loc.shape.magnet import evaluate_field, FieldModel, magnet_parameters
 from numba import njit
 import numpy as np
 

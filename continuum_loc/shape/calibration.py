@@ -19,24 +19,17 @@ from itertools import permutations
 from pathlib import Path
 
 from continuum_loc import lie
+from continuum_loc.errors import CalibrationError, SettingsError
+from continuum_loc.magnet import field_and_gradient, FieldModel
 from continuum_loc.robot import RobotDescription, Vector3
-from continuum_loc.settings import load_settings, Settings, SettingsError
+from continuum_loc.settings import load_settings, Settings
 from continuum_loc.shape.attitude import GRAVITY
-from continuum_loc.shape.magnet import field_and_gradient, FieldModel
 from continuum_loc.shape.rest import Rest
 import numpy as np
 from pydantic import Field
 from scipy.optimize import least_squares
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
-
-
-class CalibrationError(ValueError):
-    """
-    Rests that no calibration explains.
-
-    The message says what is wrong with the robot or its wiring.
-    """
 
 
 class ModuleCalibration(Settings):

@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Literal
 
 from continuum_loc import lie
+from continuum_loc.errors import CalibrationError, MotionError
+from continuum_loc.magnet import FieldModel
 from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds, seconds
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import load_settings, Settings
@@ -26,7 +28,6 @@ from continuum_loc.shape.backbone import BackboneFit, BackboneSolver
 from continuum_loc.shape.calibration import (
     calibrate,
     Calibration,
-    CalibrationError,
     check_wiring,
     load_calibration,
     module_mounts,
@@ -35,9 +36,8 @@ from continuum_loc.shape.calibration import (
     straight_modules,
 )
 from continuum_loc.shape.curves import arclength, CurveMethod, extended, fit_curve
-from continuum_loc.shape.magnet import FieldModel
 from continuum_loc.shape.position import PositionSolver
-from continuum_loc.shape.rest import MotionError, Rest, RestWindow
+from continuum_loc.shape.rest import Rest, RestWindow
 import numpy as np
 from pydantic import Field
 

@@ -16,8 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from continuum_loc.robot import Magnet
-from continuum_loc.shape.magnet import (
+from continuum_loc.magnet import (
     evaluate_field,
     field_and_gradient,
     FieldModel,
@@ -25,6 +24,7 @@ from continuum_loc.shape.magnet import (
     invert_dipole_once,
     magnet_parameters,
 )
+from continuum_loc.robot import Magnet
 from numba import njit
 import numpy as np
 

@@ -10,19 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from continuum_loc.errors import MotionError
 from continuum_loc.measurements import FieldSample, ImuSample
 from continuum_loc.robot import RobotDescription
 import numpy as np
 
 GATE = 6.0  # standard deviations; with 9 channels of 3 modules a false alarm in some 1e7 rests
-
-
-class MotionError(ValueError):
-    """
-    The robot moved while it had to be at rest.
-
-    The message names the sensors and by how much.
-    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 
-from continuum_loc.simulator.scene import SceneError
+from continuum_loc.errors import SceneError
 import numpy as np
 
 SMALL = 2000  # faces that CoACD gets done within tens of seconds

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from continuum_loc.errors import SceneError
 from continuum_loc.simulator import convex, cutting
 from continuum_loc.simulator.convex import convex_pieces
-from continuum_loc.simulator.scene import Scene, SceneError
+from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scene_cache import cached_scene
 import numpy as np
 

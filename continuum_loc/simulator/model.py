@@ -14,8 +14,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from continuum_loc.errors import SettingsError, SimulationDiverged
 from continuum_loc.robot import Ring, RobotDescription
-from continuum_loc.settings import SettingsError
 from continuum_loc.simulator.plant import node_arclengths, PlantSettings, Profile
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,10 +42,6 @@ STICTION = (
 LEAST_INERTIA = 1e-15  # kg and kg m^2: MuJoCo's least
 DIVERGED_SPEED = 1e3  # rad/s or m/s
 GUIDE = 0.25  # share of a segment that tendons cross unguided, in its middle
-
-
-class SimulationDiverged(RuntimeError):
-    """The simulation cannot go on; the message says when, where and what to change."""
 
 
 def build_spec(

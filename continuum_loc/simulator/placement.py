@@ -7,9 +7,10 @@ contacts wherever they will, or stays there for good.
 
 from __future__ import annotations
 
+from continuum_loc.errors import SceneError
 from continuum_loc.robot import RobotDescription
 from continuum_loc.simulator.raycast import RayCaster
-from continuum_loc.simulator.scene import Scene, SceneError
+from continuum_loc.simulator.scene import Scene
 import numpy as np
 
 _MOUNT = 2.0  # radii next to the base that may be inside of what it is mounted on

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from continuum_loc.errors import SettingsError
 from continuum_loc.robot import RobotDescription
-from continuum_loc.settings import load_bundled, Settings, SettingsError
+from continuum_loc.settings import load_bundled, Settings
 import numpy as np
 from pydantic import Field, model_validator
 

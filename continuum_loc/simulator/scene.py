@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
 
-class SceneError(ValueError):
-    """A scene that cannot be used; the message says what is wrong with it and what to change."""
-
-
 @dataclass(frozen=True, eq=False)
 class Anomaly:
     """

@@ -11,7 +11,8 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from continuum_loc.simulator.scene import Scene, SceneError
+from continuum_loc.errors import SceneError
+from continuum_loc.simulator.scene import Scene
 
 ENGINE_SCENES = tuple(f'S{i}' for i in range(10))
 HOLD_OUT_SCENES = ('H1', 'H2', 'H3')  # the engine again, to tune a detector on

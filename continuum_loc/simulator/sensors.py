@@ -140,7 +140,7 @@ class HallSensors:
         total = np.broadcast_to(self.earth_field, (len(T_map_hall), 3))
         if self.magnet is None:
             return total
-        from continuum_loc.shape.magnet import ring_field
+        from continuum_loc.magnet import ring_field
 
         p_magnet = (lie.inverse(T_map_magnet) @ T_map_hall)[:, :3, 3]
         return total + ring_field(self.magnet, p_magnet) @ T_map_magnet[:3, :3].T

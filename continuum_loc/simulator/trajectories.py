@@ -13,8 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from continuum_loc.errors import SettingsError
 from continuum_loc.robot import RobotDescription
-from continuum_loc.settings import load_settings, Settings, SettingsError
+from continuum_loc.settings import load_settings, Settings
 from continuum_loc.simulator.plant import PlantSettings
 import numpy as np
 from pydantic import Field
@@ -34,7 +35,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
+class Drive:
     """
     Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m.
 
@@ -155,9 +156,7 @@ class TrajectoryFile(Settings):
     supported: bool = False
 
 
-def trajectory(
-    name: str, robot: RobotDescription, plant: PlantSettings, seed: int = 0
-) -> Trajectory:
+def trajectory(name: str, robot: RobotDescription, plant: PlantSettings, seed: int = 0) -> Drive:
     """
     Find the named trajectory of this robot, or load one from a YAML file (`TrajectoryFile`).
 
@@ -170,7 +169,7 @@ def trajectory(
     return made if seed == 0 else _varied(made, np.random.default_rng(seed))
 
 
-def _bundled(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+def _bundled(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
     tables = TRAJECTORIES.get(robot.name, {})
     if name not in tables:
         raise SettingsError(
@@ -180,7 +179,7 @@ def _bundled(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajec
     return tables[name](name, robot, plant)
 
 
-def _from_file(path: str, plant: PlantSettings) -> Trajectory:
+def _from_file(path: str, plant: PlantSettings) -> Drive:
     read = load_settings(TrajectoryFile, path)
     frames = read.keyframes
     for k, frame in enumerate(frames):
@@ -191,7 +190,7 @@ def _from_file(path: str, plant: PlantSettings) -> Trajectory:
             )
         _check_forces(f'{path}: keyframes.{k}.tensions', np.array(frame.tensions), plant)
     try:
-        return Trajectory(
+        return Drive(
             Path(path).stem,
             np.array([frame.time for frame in frames]),
             np.array([frame.tensions for frame in frames]),
@@ -216,13 +215,13 @@ def trajectory_names(robot: RobotDescription) -> tuple[str, ...]:
     return tuple(TRAJECTORIES.get(robot.name, {}))
 
 
-def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
     rows = _ENGINE[name]
     curvature = np.array([row[2:] for row in rows])  # (M, modules, 2)
     moments = plant.EI * curvature
     if len(plant.tendons) == moments.shape[1]:  # else refused below, with what there is
         moments = moments + _level_moments(robot, plant)
-    return Trajectory(
+    return Drive(
         name,
         np.array([row[0] for row in rows]),
         plant.tension_for_moments(moments),
@@ -246,7 +245,7 @@ def _level_moments(robot: RobotDescription, plant: PlantSettings) -> np.ndarray:
     return np.stack([-mean, np.zeros_like(mean)], axis=-1)
 
 
-def _varied(base: Trajectory, rng: np.random.Generator) -> Trajectory:
+def _varied(base: Drive, rng: np.random.Generator) -> Drive:
     moving = base.times > REST
     scale = 1.0 + 0.05 * rng.standard_normal((len(base.times), 1)) * moving[:, None]
     insertion = np.clip(
@@ -413,18 +412,18 @@ _FREE = {
 }
 
 
-def _box(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+def _box(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
     rows = np.array(_BOX[name], float)
-    return Trajectory(name, rows[:, 0], rows[:, 1:], np.zeros(len(rows)))
+    return Drive(name, rows[:, 0], rows[:, 1:], np.zeros(len(rows)))
 
 
-def _free(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+def _free(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
     rows = np.array(_FREE[name], float)
     tensions = plant.tension_for_moments(plant.EI * rows[:, None, 1:])
-    return Trajectory(name, rows[:, 0], tensions, np.zeros(len(rows)))
+    return Drive(name, rows[:, 0], tensions, np.zeros(len(rows)))
 
 
-def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
     """
     From straight into the groove within three seconds, then still.
 
@@ -433,7 +432,7 @@ def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Traject
     curvature = _GROOVES[name] * np.array([0.0, 1.0, 1.0])
     moments = plant.EI * np.stack([curvature, np.zeros(3)], axis=-1)[:, None, :]
     times = np.array([REST, REST + 3.0, REST + 9.0])
-    return Trajectory(name, times, plant.tension_for_moments(moments), np.zeros(3), supported=True)
+    return Drive(name, times, plant.tension_for_moments(moments), np.zeros(3), supported=True)
 
 
 TRAJECTORIES = {

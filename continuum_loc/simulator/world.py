@@ -19,9 +19,9 @@ import logging
 from pathlib import Path
 from typing import Any, get_args, TYPE_CHECKING
 
+from continuum_loc.errors import SettingsError
 from continuum_loc.measurements import Measurement, NANOSECONDS, TruthSample
 from continuum_loc.robot import RobotDescription, Sensor
-from continuum_loc.settings import SettingsError
 from continuum_loc.simulator import sensors as models
 from continuum_loc.simulator.model import (
     advance,
@@ -38,7 +38,7 @@ from continuum_loc.simulator.plant import (
     node_arclengths,
     PlantSettings,
 )
-from continuum_loc.simulator.trajectories import Trajectory, trajectory
+from continuum_loc.simulator.trajectories import Drive, trajectory
 import numpy as np
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class World:
     A robot, a scene and a trajectory; `run` simulates them from rest.
 
     plant: PlantSettings, a name or a YAML file; None takes the bundled plant of the robot's name.
-    trajectory: a name of `trajectories.trajectory`, or a Trajectory.
+    trajectory: a name of `trajectories.trajectory`, or a Drive.
     scene: None is empty space, without ToF frames.
     faults: wrappers of `faults`, applied to the stream in order.
     """
@@ -74,7 +74,7 @@ class World:
         self,
         robot: RobotDescription,
         scene: Scene | None,
-        trajectory: str | Trajectory,
+        trajectory: str | Drive,
         *,
         plant: PlantSettings | str | Path | None = None,
         profile: str = 'live',
@@ -246,7 +246,7 @@ class _Body:
     """MuJoCo's side: drives in, states out."""
 
     def __init__(
-        self, robot: RobotDescription, plant: PlantSettings, model: Any, path: Trajectory
+        self, robot: RobotDescription, plant: PlantSettings, model: Any, path: Drive
     ) -> None:
         import mujoco
 
@@ -357,7 +357,7 @@ def _plant(name: str | Path | None, robot: RobotDescription) -> PlantSettings:
     return load_plant(name or robot.name)
 
 
-def _resolve(path: str | Trajectory, robot: RobotDescription, plant: PlantSettings) -> Trajectory:
+def _resolve(path: str | Drive, robot: RobotDescription, plant: PlantSettings) -> Drive:
     path = trajectory(path, robot, plant) if isinstance(path, str) else path
     tendons = len(plant.tendon_names)
     if path.tensions.shape[1] != tendons:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from continuum_loc.estimator.factors.base import (
-    ClockScores,
-    Factor,
-    FactorReport,
-    MeasurementError,
-)
+from continuum_loc.errors import MeasurementError
+from continuum_loc.estimator.factors.base import ClockScores, Factor, FactorReport
 from continuum_loc.estimator.factors.field import FieldFactor
 from continuum_loc.estimator.factors.gravity import GravityFactor
 from continuum_loc.estimator.factors.gyro import GyroFactor

@@ -14,19 +14,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator.chain import Blocks
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
 from continuum_loc.robot import RobotDescription
 import numpy as np
-
-
-class MeasurementError(ValueError):
-    """A measurement that cannot be used; `reason` is the short name under which it is counted."""
-
-    def __init__(self, reason: str, message: str):
-        super().__init__(message)
-        self.reason = reason
 
 
 @dataclass(slots=True)

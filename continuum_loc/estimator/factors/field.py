@@ -1,21 +1,18 @@
 """
 Hall sensor: the field of the magnet at the base (and Earth's), in the body frame.
 
-See `shape/observations.py`.
+See `magnet.py`.
 """
 
 from __future__ import annotations
 
 from continuum_loc import lie
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import (
-    Factor,
-    FactorReport,
-    known_sensor,
-    MeasurementError,
-)
+from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor
 from continuum_loc.estimator.output import interpolated_poses
 from continuum_loc.estimator.state import VELOCITY
+from continuum_loc.magnet import field_residual_and_jacobian
 from continuum_loc.measurements import FieldSample
 import numpy as np
 
@@ -67,8 +64,6 @@ class FieldFactor(Factor):
         )
 
     def linearise(self, batch, a, b, blocks):
-        from continuum_loc.shape.observations import field_residual_and_jacobian
-
         times, nodes, measured, weights = batch
         T, J_pose = interpolated_poses(a, b, times, nodes)
         e, J = field_residual_and_jacobian(

@@ -7,14 +7,9 @@ A body-frame observation of a known map vector; e = R^T up |g| - f, de/dphi = ha
 from __future__ import annotations
 
 from continuum_loc import lie_kernels
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import (
-    Factor,
-    FactorReport,
-    known_sensor,
-    MeasurementError,
-    require_finite,
-)
+from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.measurements import ImuSample
 from numba import njit

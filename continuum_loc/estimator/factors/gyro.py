@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from continuum_loc import lie_kernels
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import (
     ClockScores,
     Factor,
     FactorReport,
     known_sensor,
-    MeasurementError,
     Repeats,
     require_finite,
 )

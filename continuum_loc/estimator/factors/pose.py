@@ -7,14 +7,9 @@ e = Log(T_measured^-1 T), J = J_r(e)^-1 for a right perturbation.
 from __future__ import annotations
 
 from continuum_loc import lie, lie_kernels
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import (
-    Factor,
-    FactorReport,
-    known_sensor,
-    MeasurementError,
-    require_finite,
-)
+from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
 from continuum_loc.estimator.state import VELOCITY
 from continuum_loc.measurements import EncoderSample, TrackedPose
 from numba import njit

@@ -9,13 +9,9 @@ below sigma_kappa.
 from __future__ import annotations
 
 from continuum_loc import lie_kernels
+from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.factors.base import (
-    Factor,
-    FactorReport,
-    MeasurementError,
-    require_finite,
-)
+from continuum_loc.estimator.factors.base import Factor, FactorReport, require_finite
 from continuum_loc.estimator.state import NODE_DIM, STRAIN
 from continuum_loc.measurements import StrainSample
 from numba import njit

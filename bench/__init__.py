@@ -1,0 +1,1 @@
+"""Benchmarks: everything one waits for, beside what one would use instead."""

@@ -1,5 +1,0 @@
-"""
-Studies behind the figures that the README quotes, one module each.
-
-See `continuum_loc.evaluation.study`.
-"""

@@ -1,0 +1,312 @@
+"""
+A node that estimates: callbacks only buffer, and one worker thread does everything else.
+
+Reception is a single-threaded executor, so that a slow step never blocks it; what an overloaded
+worker leaves behind is dropped by `Inbox` in its defined order, counted, and told on /diagnostics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+import gc
+from queue import SimpleQueue
+import threading
+import time
+import traceback
+from typing import Any, TypeVar
+
+from continuum_loc.intake import Early, Inbox, Intake, Queued
+from continuum_loc.measurements import Measurement, NANOSECONDS
+from continuum_loc.nodes.support.parameters import live_fields
+from continuum_loc.nodes.support.runtime import (
+    Delays,
+    input_qos,
+    output_qos,
+    PackageNode,
+    write_summary,
+)
+from continuum_loc.nodes.support.settings import IntakeSettings
+from continuum_loc.robot import load_robot
+from continuum_loc.settings import Settings
+from msg_tools.factory import ros_messages
+from msg_tools.records import DiagnosticsRecord
+from msg_tools.topics import topic_spec, TRACKER
+import numpy as np
+
+T = TypeVar('T')
+
+OK, WARN, ERROR, STALE = range(4)
+POLL = 0.1  # s; how often an idle worker looks whether it has to stop
+STALE_AFTER = 2.0  # s without data
+CLOCK_PATIENCE = 3.0  # s; how long a message waits for a simulated clock that is behind it
+# [s] older stamps come from a bag played without its clock, and say nothing about latency.
+PLAUSIBLE_LATENCY = 30.0
+
+
+class WorkerNode(PackageNode):
+    """
+    Base of `estimator` and `shape`.
+
+    Subclasses give `inputs`, `consume`, `restart` and `describe`.
+    """
+
+    inputs: tuple[str, ...] = ()
+
+    def __init__(self, name: str, defaults: Settings, **options: Any) -> None:
+        super().__init__(name, defaults, **options)
+        self.robot = load_robot(self.settings.robot)
+        self.inbox = Inbox(self.settings.intake)
+        self.early = Early(CLOCK_PATIENCE)
+        self.intake = Intake(
+            self.robot, self.settings.intake, self._report, self.settings.frame_prefix
+        )
+        self.latency, self.lag, self.step = Delays(), Delays(), Delays()
+        self.failures = 0
+        self.outputs: dict[str, Any] = {}
+        self._stop = threading.Event()
+        self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._received_at = 0.0
+        self._told: dict[str, int] = {}
+        self._thread = threading.Thread(target=self._work, name=f'{name} worker', daemon=True)
+
+    # ------------------------------------------------ for subclasses
+
+    def consume(self, measurement: Measurement) -> int | None:
+        """
+        Use one measurement and publish what follows from it.
+
+        Returns the stamp of the estimate if there is one.
+        """
+        raise NotImplementedError
+
+    def idle(self) -> bool:
+        """Do a little of what can wait, as no message does; False where there is nothing to do."""
+        return False
+
+    def restart(self) -> None:
+        """Forget the past: the data starts again. Called in the worker."""
+        raise NotImplementedError
+
+    def describe(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values of the estimate itself, for /diagnostics."""
+        raise NotImplementedError
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the summary file holds."""
+        return {
+            'counts': self.counts(),
+            'latency_ms': self.latency.statistics(),
+            'lag_ms': self.lag.statistics(),
+            'step_ms': self.step.statistics(),
+            'latencies_s': list(self.latency.values),
+        }
+
+    # ------------------------------------------------ life
+
+    def begin(self) -> None:
+        """Subscribe and start to work: call it when everything is ready for data."""
+        self.check_parameters()
+        for topic in self._input_topics():
+            spec = topic_spec(topic)
+            self.listen(
+                spec.type,
+                topic,
+                partial(self._receive, topic),
+                input_qos(spec, self.settings.intake.reliable_inputs),
+            )
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+        # What was loaded and compiled stays: to go through it again and again, as the collector
+        # else does, stops the worker for 30 ms each time.
+        gc.collect()
+        gc.freeze()
+        self._thread.start()
+        self.get_logger().info(f"ready: robot '{self.robot.name}'")
+
+    def close(self) -> None:
+        """Stop the worker and write the summary."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10.0)
+        write_summary(self.settings.summary_file, self.summary())
+
+    def counts(self) -> dict[str, Any]:
+        """
+        Count what was received, used, refused and dropped before the estimator.
+
+        Refused by class of error, dropped by topic.
+        """
+        return {
+            'received': dict(self.inbox.received),
+            'used': dict(self.intake.used),
+            'refused': dict(self.intake.refused),
+            'dropped': dict(self.inbox.dropped),
+            'restarts': self.intake.gate.restarts,
+            'failures': self.failures,
+        }
+
+    def in_worker(self, task: Callable[[], None]) -> None:
+        """
+        Have the worker do `task` before its next message.
+
+        Services and parameters ask from other threads.
+        """
+        self._tasks.put(task)
+
+    def publish(self, topic: str, item: Any) -> None:
+        """Encode and publish an item of the contract."""
+        spec = topic_spec(topic)
+        self.publish_message(topic, spec.encode(ros_messages(), item))
+
+    def publish_message(self, topic: str, message: Any) -> None:
+        """Publish a message on a topic of the contract; the publisher is made at its first use."""
+        self.publisher(topic).publish(message)
+
+    def publisher(self, topic: str) -> Any:
+        """Return the publisher of a topic of the contract."""
+        if topic not in self.outputs:
+            spec = topic_spec(topic)
+            self.outputs[topic] = self.create_publisher(
+                ros_messages().resolve(spec.type), topic, output_qos(spec)
+            )
+        return self.outputs[topic]
+
+    # ------------------------------------------------ reception (executor thread)
+
+    def _input_topics(self) -> list[str]:
+        trackers = (
+            [TRACKER + sensor.name for sensor in self.robot.trackers]
+            if TRACKER in self.inputs
+            else []
+        )
+        return [topic for topic in self.inputs if topic != TRACKER] + trackers
+
+    def _receive(self, topic: str, message: Any) -> None:
+        self._received_at = time.monotonic()
+        self.inbox.put(topic, message, self.now())
+
+    # ------------------------------------------------ estimation (worker thread)
+
+    def _work(self) -> None:
+        try:
+            while not self._stop.is_set():
+                leisure = not len(self.inbox) and self._attempt(self.idle, 'what it had seen')
+                queued = self.inbox.take(0.0 if leisure else POLL)
+                while not self._tasks.empty():
+                    self._tasks.get()()
+                for one in self._timely(queued):
+                    self._handle(one)
+        except Exception:
+            if self.context.ok() and not self._stop.is_set():
+                self.get_logger().fatal(f'the worker failed:\n{traceback.format_exc()}')
+                self.failures += 1
+            self.finish()
+
+    def _timely(self, queued: Queued | None) -> list[Queued]:
+        """Messages whose turn it is: `queued`, unless a simulated clock is behind it."""
+        new = [] if queued is None else [queued]
+        if not (self.get_clock().ros_time_is_active or len(self.early)):
+            return new
+        return self.early.timely(new, self.now(), self.settings.intake.future_tolerance)
+
+    def _handle(self, queued: Queued) -> None:
+        restarts = self.intake.gate.restarts
+        measurement = self.intake.accept(queued.topic, queued.message, queued.arrival)
+        if self.intake.gate.restarts != restarts:
+            self.get_logger().warning(
+                'time went backward: the data starts again, and so does the estimate'
+            )
+            self.restart()
+        if measurement is None:
+            return
+        begin = time.perf_counter()
+        stamp = self._attempt(lambda: self.consume(measurement), queued.topic)
+        if stamp is not None:
+            self._note(stamp, queued, time.perf_counter() - begin)
+
+    def _attempt(self, action: Callable[[], T], what: str) -> T | None:
+        """Do `action`; a failure on what it was given is counted, and the estimate starts anew."""
+        try:
+            return action()
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+            self.failures += 1
+            self.intake.refuse(
+                'failure',
+                f'the estimator failed on {what} ({type(error).__name__}: {error}) '
+                'and starts anew',
+            )
+            self.restart()
+            return None
+
+    def _note(self, stamp: int, queued: Queued, seconds: float) -> None:
+        self.step.add(seconds)
+        self.lag.add(time.monotonic() - queued.received)
+        latency = (self.now() - stamp) / NANOSECONDS
+        if abs(latency) < PLAUSIBLE_LATENCY:
+            self.latency.add(latency)
+
+    # ------------------------------------------------ parameters, diagnostics
+
+    def live_parameters(self) -> set[str]:
+        """Return those of the node and of its intake."""
+        intake = {f'intake.{name}' for name in live_fields(IntakeSettings)}
+        return super().live_parameters() | intake
+
+    def _change(self, values: dict[str, Any]) -> str | None:
+        reason = super()._change(values)
+        self.inbox.settings = self.intake.settings = self.intake.gate.settings = (
+            self.settings.intake
+        )
+        return reason
+
+    def _report(self, kind: str, text: str) -> None:
+        self.get_logger().warning(f"{text} [further cases of '{kind}' are only counted]")
+
+    def _publish_diagnostics(self) -> None:
+        level, text, values = self.describe()
+        for check in (self._check_losses, self._check_lag, self._check_silence):
+            level, text = max((level, text), check(), key=lambda pair: pair[0])
+        values = {
+            'received': sum(self.inbox.received.values()),
+            'used': sum(self.intake.used.values()),
+            'refused': dict(self.intake.refused),
+            'dropped': dict(self.inbox.dropped),
+            'queue': len(self.inbox) + len(self.early),
+            **values,
+        }
+        shown = {
+            key: f'{value:.4g}' if isinstance(value, float) else str(value)
+            for key, value in values.items()
+        }
+        name = f'{self.get_fully_qualified_name()}: {self.robot.name}'
+        self.publish('/diagnostics', DiagnosticsRecord(self.now(), ((name, level, text, shown),)))
+
+    def _check_losses(self) -> tuple[int, str]:
+        lost = {
+            'dropped': sum(self.inbox.dropped.values()),
+            'refused': sum(self.intake.refused.values()),
+            'failures': self.failures,
+        }
+        new = {
+            key: count - self._told.get(key, 0)
+            for key, count in lost.items()
+            if count > self._told.get(key, 0)
+        }
+        self._told = lost
+        return (
+            (WARN, 'messages ' + ', '.join(f'{key}: {count}' for key, count in new.items()))
+            if new
+            else (OK, '')
+        )
+
+    def _check_lag(self) -> tuple[int, str]:
+        recent = self.lag.recent(10)
+        if len(recent) and float(np.median(recent)) > self.settings.lag_warning:
+            return WARN, f'lagging {1e3 * float(np.median(recent)):.0f} ms behind reception'
+        return OK, ''
+
+    def _check_silence(self) -> tuple[int, str]:
+        if self._received_at == 0.0:
+            return WARN, 'no data yet'
+        silent = time.monotonic() - self._received_at
+        return (ERROR, f'no data for {silent:.1f} s') if silent > STALE_AFTER else (OK, '')

@@ -1,0 +1,1 @@
+"""What a user does with recordings: replay, judge, report, tune, simulate, demonstrate."""

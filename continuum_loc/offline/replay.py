@@ -1,0 +1,222 @@
+"""
+Run a filter over recorded measurements without a ROS graph.
+
+The same bag gives the same estimate, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+import hashlib
+from pathlib import Path
+import time
+from typing import Any, Protocol
+
+from continuum_loc.estimate import Estimate
+from continuum_loc.measurements import (
+    EncoderSample,
+    FieldSample,
+    ImuSample,
+    Measurement,
+    NANOSECONDS,
+    seconds,
+    StrainSample,
+    TOF_HALF_CONFIDENT,
+    TOF_VALID,
+    TofFrame,
+    TrackedPose,
+    TruthSample,
+)
+from continuum_loc.robot import RobotDescription
+from continuum_loc.trajectory import known_at, Trajectory
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+SAMPLES = (TofFrame, ImuSample, StrainSample, FieldSample, TrackedPose, EncoderSample, TruthSample)
+CLOUD_PERIOD = NANOSECONDS // 4  # of each sensor, one frame in this time is kept for pictures
+
+
+class Filter(Protocol):
+    """What `replay` asks of a filter; `SlidingWindowFilter` is one."""
+
+    robot: RobotDescription
+    counts: dict[str, Any]
+
+    def process(self, measurement: Measurement) -> Estimate | None: ...
+    def flush(self) -> Estimate | None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """
+    M time-of-flight points as the estimate places them.
+
+    Stamps (M,) ns, points (M, 3) in `map` [m].
+    """
+
+    stamps: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayResult:
+    """
+    What a run of the filter gave.
+
+    track: the body at the newest instant of each step; lagged: the same at the smoothing lag (may
+    be empty).
+    truth: recorded truth (may be empty).
+    consistency: (K,) mean normalised innovation squared at each step of `track`.
+    step_seconds: (N,) time of each step; latency_seconds: (N,) from sensor stamp to published pose
+    (live runs only).
+    processing_seconds, data_seconds: time spent in the filter, and time that the data spans.
+    cpu_seconds: processor time of the same, over all threads: less than the former where others
+    use the machine.
+    cloud: a share of the ToF points; counts: what the filter received, used and dropped, and why.
+    """
+
+    track: Trajectory
+    lagged: Trajectory
+    truth: Trajectory
+    consistency: np.ndarray
+    step_seconds: np.ndarray
+    processing_seconds: float
+    data_seconds: float
+    cloud: Cloud
+    counts: dict[str, Any]
+    latency_seconds: np.ndarray = field(default_factory=lambda: np.empty(0))
+    cpu_seconds: float = float('nan')
+
+    @property
+    def real_time_factor(self) -> float:
+        """Divide data time by processing time; nan when there was nothing to estimate."""
+        return (
+            self.data_seconds / self.processing_seconds if len(self.step_seconds) else float('nan')
+        )
+
+    @property
+    def digest(self) -> str:
+        """Hash of every stamp, pose and covariance: equal for equal estimates, to the last bit."""
+        hashed = hashlib.sha256()
+        for track in (self.track, self.lagged):
+            for values in (track.stamps, track.T_map_ring, track.covariance):
+                hashed.update(b'-' if values is None else np.ascontiguousarray(values).tobytes())
+        return hashed.hexdigest()
+
+
+def samples_of(bag: str | Path) -> Iterator[Measurement | TruthSample]:
+    """Measurements and truth of a recorded bag, in the order of recording."""
+    from msg_tools.bag import read_bag
+
+    return (item for _, item in read_bag(Path(bag)) if isinstance(item, SAMPLES))
+
+
+def replay(
+    source: str | Path | Iterable[Measurement | TruthSample], estimator: Filter
+) -> ReplayResult:
+    """
+    Feed a bag (its path) or samples in stamp order to `estimator`.
+
+    It runs in this thread, as fast as it goes.
+    """
+    with one_thread():
+        return _replay(
+            samples_of(source) if isinstance(source, (str, Path)) else source, estimator
+        )
+
+
+def one_thread() -> threadpool_limits:
+    """
+    Limit numeric libraries to one thread; as a context manager, until its end.
+
+    On more threads BLAS sums in another order. Left to the machine, to the environment and to
+    what a cluster sets for its workers, the same bag would give another last bit.
+    """
+    import scipy.linalg  # noqa: F401  # brings a BLAS of its own: limited only once loaded
+
+    return threadpool_limits(1)
+
+
+def _replay(samples: Iterable[Measurement | TruthSample], estimator: Filter) -> ReplayResult:
+    log = _Log(estimator.robot)
+    for sample in samples:
+        if isinstance(sample, TruthSample):
+            log.truth.append(sample)
+            continue
+        log.received(sample)
+        log.step(estimator.process, sample)
+    log.step(estimator.flush)
+    return log.result(estimator.counts)
+
+
+class _Log:
+    """Gathers what passes while the filter runs."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self.robot = robot
+        self.truth: list[TruthSample] = []
+        self.estimates: list[Estimate] = []
+        self.frames: list[TofFrame] = []
+        self.step_seconds: list[float] = []
+        self.processing_seconds = self.cpu_seconds = 0.0
+        self.first, self.last = np.iinfo(np.int64).max, 0
+        self._next_frame: dict[str, int] = {}
+
+    def received(self, sample: Measurement) -> None:
+        self.first, self.last = min(self.first, sample.stamp), max(self.last, sample.stamp)
+        if isinstance(sample, TofFrame) and sample.stamp >= self._next_frame.get(sample.sensor, 0):
+            self.frames.append(sample)
+            self._next_frame[sample.sensor] = sample.stamp + CLOUD_PERIOD
+
+    def step(self, call: Any, *arguments: Measurement) -> None:
+        start, cpu = time.perf_counter(), time.process_time()
+        estimate = call(*arguments)
+        elapsed = time.perf_counter() - start
+        self.cpu_seconds += time.process_time() - cpu
+        self.processing_seconds += elapsed
+        if estimate is not None:
+            self.estimates.append(estimate)
+            self.step_seconds.append(elapsed)
+
+    def result(self, counts: dict[str, Any]) -> ReplayResult:
+        names = self.robot.ring_names
+        latest = {estimate.stamp: estimate.consistency for estimate in self.estimates}
+        track = Trajectory.from_estimates(self.estimates, names)
+        return ReplayResult(
+            track=track,
+            lagged=Trajectory.from_estimates(
+                (e.lagged for e in self.estimates if e.lagged is not None), names
+            ),
+            truth=Trajectory.from_truth(self.truth, names),
+            consistency=np.array([latest[stamp] for stamp in sorted(latest)], float),
+            step_seconds=np.array(self.step_seconds),
+            processing_seconds=self.processing_seconds,
+            data_seconds=max(seconds(self.last, self.first), 0.0) if self.last else 0.0,
+            cloud=place_points(self.frames, track, self.robot),
+            counts=counts,
+            cpu_seconds=self.cpu_seconds,
+        )
+
+
+def place_points(frames: Iterable[TofFrame], track: Trajectory, robot: RobotDescription) -> Cloud:
+    """Place the valid points of `frames` in `map`, by the pose of their ring at their stamp."""
+    frames = list(frames)
+    known = known_at(
+        track.stamps, np.array([frame.stamp for frame in frames], np.int64), longest_gap=1.0
+    )
+    frames = [frame for frame, usable in zip(frames, known, strict=True) if usable]
+    if not frames:
+        return Cloud(np.empty(0, np.int64), np.empty((0, 3)))
+    stamps = np.array([frame.stamp for frame in frames], np.int64)
+    columns = [track.names.index(robot.sensor(frame.sensor).ring) for frame in frames]
+    T_ring_sensor = np.stack([robot.sensor(frame.sensor).mount.T_ring_sensor for frame in frames])
+    T_map_sensor = track.at(stamps)[np.arange(len(frames)), columns] @ T_ring_sensor
+    placed, at = [], []
+    for T, frame in zip(T_map_sensor, frames, strict=True):
+        valid = np.isin(frame.status, (TOF_VALID, *TOF_HALF_CONFIDENT)) & np.isfinite(
+            frame.points
+        ).all(axis=1)
+        placed.append(frame.points[valid] @ T[:3, :3].T + T[:3, 3])
+        at.append(np.full(valid.sum(), frame.stamp, np.int64))
+    return Cloud(np.concatenate(at), np.concatenate(placed))

@@ -1,0 +1,247 @@
+"""
+One trial: a robot simulated in a scene, a prior map, and the filter over the samples.
+
+Studies, tests and the command line all build their trials here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import hashlib
+import os
+from pathlib import Path
+import shutil
+from typing import Any, TYPE_CHECKING
+
+from continuum_loc import lie
+from continuum_loc.measurements import Measurement, TruthSample
+from continuum_loc.offline.replay import Filter, replay, ReplayResult
+from continuum_loc.robot import load_robot, RobotDescription
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from continuum_loc.estimator.settings import EstimatorSettings
+    from continuum_loc.mapping.prior_map import PriorMap
+    from continuum_loc.simulator.world import World
+
+MAP_POINTS = 300_000
+# What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF
+# stamps share.
+MOUNTING_ERROR = (0.002, 1.0)  # m, deg
+GYRO_BIAS = 0.01  # rad/s
+TOF_CLOCK_OFFSET = 0.010  # s
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    What decides a simulated trial.
+
+    robot: a bundled name or a YAML file. scene, map_scene: scene names or mesh files; the prior
+    map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
+    `paper` or `vl53l5cx`. plant: a bundled name or a YAML file; None for the robot's own.
+    disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
+    drawn_base: the base sits where a draw from the description's own spread puts it, not where
+    the description says: what a covariance that counts with this spread has to be judged by.
+    duration: seconds; None for the trajectory's own.
+    """
+
+    robot: str = 'engine'
+    scene: str = 'S0'
+    trajectory: str = 't1'
+    map_scene: str | None = None
+    profile: str = 'live'
+    fidelity: str = 'paper'
+    disturbed: bool = False
+    drawn_base: bool = False
+    seed: int = 0
+    duration: float | None = None
+    plant: str | None = None
+
+    @property
+    def recording(self) -> str:
+        """Name of what is simulated; trials that differ in the map alone share it."""
+        length = '' if self.duration is None else f'-{self.duration:g}s'
+        return (
+            '-'.join(
+                [
+                    Path(self.robot).stem,
+                    Path(self.scene).stem,
+                    self.trajectory,
+                    self.fidelity,
+                    self.profile,
+                ]
+                + ['disturbed'] * self.disturbed
+                + ['drawn'] * self.drawn_base
+                + [Path(self.plant or '').stem] * bool(self.plant)
+            )
+            + f'-{self.seed}{length}'
+        )
+
+    @property
+    def name(self) -> str:
+        """Name the trial, uniquely among trials."""
+        return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
+
+
+def world(trial: Trial, faults: tuple = ()) -> World:
+    """Make the simulated world of a trial, at rest."""
+    from continuum_loc.simulator.scenes import load_scene
+    from continuum_loc.simulator.world import World
+
+    robot = load_robot(trial.robot)
+    if trial.drawn_base:
+        robot = _base_drawn(robot, trial.seed)
+    if trial.disturbed:
+        robot, faults = _disturbed(robot, trial.seed, faults)
+    return World(
+        robot,
+        load_scene(trial.scene) if robot.tof else None,
+        trial.trajectory,
+        plant=trial.plant,
+        profile=trial.profile,
+        tof_fidelity=trial.fidelity,
+        seed=trial.seed,
+        faults=faults,
+    )
+
+
+def _base_drawn(robot: RobotDescription, seed: int) -> RobotDescription:
+    """Move the robot's base by a draw from the spread that its description states."""
+    base = robot.base
+    sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
+    T_map_base = base.T_map_base @ lie.exp(sigma * np.random.default_rng(seed).normal(size=6))
+    rpy_deg = Rotation.from_matrix(T_map_base[:3, :3]).as_euler('xyz', degrees=True)
+    moved = {'xyz': tuple(T_map_base[:3, 3]), 'rpy_deg': tuple(rpy_deg)}
+    return robot.model_copy(update={'base': type(base)(**{**base.model_dump(), **moved})})
+
+
+def _disturbed(
+    robot: RobotDescription, seed: int, faults: tuple
+) -> tuple[RobotDescription, tuple]:
+    """Make the robot as it truly is, and its clocks."""
+    from continuum_loc.simulator.faults import ClockOffset, miscalibrated
+
+    biased = robot.model_copy(
+        update={'imu_model': robot.imu_model.model_copy(update={'gyro_bias_sigma': GYRO_BIAS})}
+    )
+    clock = ClockOffset(
+        sensors=tuple(sensor.name for sensor in robot.tof), offset=TOF_CLOCK_OFFSET
+    )
+    return miscalibrated(biased, *MOUNTING_ERROR, seed=seed), (*faults, clock)
+
+
+def simulate(trial: Trial, faults: tuple = ()) -> Iterator[Measurement | TruthSample]:
+    """Yield the samples of a trial, truth among them, in the order of their stamps."""
+    return world(trial, faults).run(trial.duration)
+
+
+def measured(trial: Trial) -> list[Measurement]:
+    """List what the sensors of a trial measure: its samples without the truth."""
+    return [sample for sample in simulate(trial) if not isinstance(sample, TruthSample)]
+
+
+def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
+    """Simulate and estimate, both in this thread; only the estimator is timed."""
+    robot = load_robot(trial.robot)
+    return replay(
+        simulate(trial),
+        make_filter(
+            robot, scene_map(trial.map_scene or trial.scene), settings or trial_settings(trial)
+        ),
+    )
+
+
+def trial_settings(trial: Trial) -> EstimatorSettings:
+    """Load the settings for the robot with sensors of the trial's fidelity, else the robot's."""
+    from continuum_loc.estimator.settings import PRESETS_FOLDER, settings_of
+
+    robot = load_robot(trial.robot).name
+    special = f'{robot}_{trial.fidelity}'
+    return settings_of(special if (PRESETS_FOLDER / f'{special}.yaml').is_file() else robot)
+
+
+def make_filter(
+    robot: RobotDescription, prior_map: PriorMap | None, settings: EstimatorSettings | None = None
+) -> Filter:
+    """Make the sliding-window filter, by default with the settings that come with the robot."""
+    from continuum_loc.estimator import settings_of, SlidingWindowFilter
+
+    return SlidingWindowFilter(robot, prior_map, settings or settings_of(robot.name))
+
+
+def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:
+    """Return the prior map of a scene, sampled from its mesh once and kept on disk."""
+    from continuum_loc.mapping.map_files import load_map
+
+    return load_map(scene_map_file(scene_name, points, seed))
+
+
+def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> Path:
+    """
+    Name the file of `scene_map`.
+
+    Its name holds a digest of the mesh, so that a changed scene has a new map.
+    """
+    from continuum_loc.mapping.build import sample_mesh
+    from continuum_loc.simulator.scenes import load_scene
+
+    scene = load_scene(scene_name)
+    digest = hashlib.sha256(scene.vertices.tobytes() + scene.faces.tobytes()).hexdigest()[:16]
+    path = map_cache() / f'{Path(scene_name).stem}-{points}-{seed}-{digest}.npz'
+    if not path.is_file():
+        prior = sample_mesh(
+            scene.vertices, scene.faces, count=points, seed=seed, source=str(scene_name)
+        )
+        partial = path.with_name(f'{path.stem}.{os.getpid()}.npz')
+        prior.save(partial)
+        partial.replace(path)  # atomic: another process sees all of it or nothing
+    return path
+
+
+def map_cache() -> Path:
+    """`$XDG_CACHE_HOME/continuum_loc/maps`, by default under `~/.cache`."""
+    return (
+        Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'continuum_loc' / 'maps'
+    )
+
+
+def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[str, int]:
+    """
+    Record samples into a new bag folder; how many of each topic.
+
+    Where the samples end in an error, no bag is left: half of one would pass for the whole.
+    """
+    from msg_tools.bag import BagWriter
+    from msg_tools.topics import topic_of
+
+    counts: dict[str, int] = {}
+    bag = BagWriter(path)
+    try:
+        with bag:
+            for sample in samples:
+                topic = topic_of(sample)
+                bag.write(topic, sample)
+                counts[topic] = counts.get(topic, 0) + 1
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
+    return counts
+
+
+def configuration(trial: Trial, **more: Any) -> dict[str, Any]:
+    """Everything that a trial was made from, for its run folder; `more` adds to it."""
+    return {
+        'robot': load_robot(trial.robot),
+        'scene': trial.scene,
+        'trajectory': trial.trajectory,
+        'map': {'scene': trial.map_scene or trial.scene, 'points': MAP_POINTS},
+        'profile': trial.profile,
+        'tof_fidelity': trial.fidelity,
+        'disturbed': trial.disturbed,
+        'seed': trial.seed,
+        'duration': trial.duration,
+        **more,
+    }

@@ -1,0 +1,1 @@
+"""What studies share: campaigns of trials, hold-outs, and what the papers and others did."""
