@@ -373,9 +373,5 @@ class RobotDescription(Settings):
 
 
 def load_robot(name_or_path: str | Path) -> RobotDescription:
-    """
-    Load a robot that comes with the package, or one of your own from a YAML file.
-
-    The package has `engine`, `soft_arm` and `hall_arm`.
-    """
+    """Load a robot of the package (`engine`, `soft_arm`, `hall_arm`) or one of your own (YAML)."""
     return load_bundled(RobotDescription, ROBOTS_FOLDER, name_or_path, 'robot')

@@ -129,11 +129,7 @@ class Witness:
 
 
 def run_cases(cases: Sequence[Case], out: Path, jobs: int) -> list[CaseResult]:
-    """
-    Simulate the recordings and replay the cases that `out` does not hold yet.
-
-    Results are in the order of `cases`.
-    """
+    """Results in the order of `cases`; what `out` does not hold yet is simulated and replayed."""
     failed = record_bags([case.trial for case in cases], out, jobs)
     todo = [(out, case) for case in cases if case.trial.recording not in failed]
     problems = dict(show_progress(parallel(replay_case, todo, jobs), len(todo), 'estimating'))
@@ -192,11 +188,7 @@ def _digest(folder: Path) -> str | None:
 
 
 def case_settings(case: Case) -> EstimatorSettings:
-    """
-    Return the settings that come with the robot, changed as the case says.
-
-    Raises SettingsError.
-    """
+    """Change the settings that come with the robot as the case says. Raises SettingsError."""
     data = load_estimator_settings(load_robot(case.trial.robot).name).model_dump()
     for section, value in case.changes.items():
         data[section] = {**data[section], **value} if isinstance(value, dict) else value
@@ -272,11 +264,7 @@ def longest_stretch(times: np.ndarray, flags: np.ndarray) -> float:
 
 
 def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
-    """
-    Find the first of `times` (K,) from which on `flags` (K,) stay true.
-
-    inf where the last one is false.
-    """
+    """Find the first of `times` (K,) from which on `flags` (K,) stay true, or inf."""
     wrong = np.flatnonzero(~flags)
     if len(wrong) == 0:
         return float(times[0])

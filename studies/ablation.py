@@ -139,11 +139,7 @@ def warm_cases(quick: bool, seed: int) -> list[Case]:
 
 
 def cold_cases(quick: bool, seed: int) -> list[Case]:
-    """
-    Start in the middle of a recording, where the robot is bent and moves.
-
-    The base is all that is known.
-    """
+    """Start in mid-recording, bent and moving, with nothing known but the base."""
     if quick:
         return [
             Case('cold', Trial(trajectory='t2', seed=seed, duration=6.0), COLD['cold'], start=4.6)

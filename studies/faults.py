@@ -100,11 +100,7 @@ beside the least share of fitting samples of each kind of sensor.
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """
-    Inject every fault into trials that no number was tuned on.
-
-    `quick`: two faults in one short trial.
-    """
+    """Inject every fault into trials that no number was tuned on; `quick`: two faults into one."""
     cases = fault_cases(quick, seed)
     require_unseen([case.trial for case in cases])
     results = run_cases(cases, out, jobs)
@@ -260,11 +256,7 @@ def accused(result: CaseResult, fault: Fault) -> set[str]:
 
 
 def named_at(result: CaseResult, fault: Fault, name: str) -> float:
-    """
-    Time [s] from the fault's start until `name` is suspected or no longer heard.
-
-    inf where it never is.
-    """
+    """Time [s] from the fault's start until `name` is suspected or no longer heard, else inf."""
     steps = [
         step
         for step in noticed(result, fault)

@@ -1,8 +1,4 @@
-"""
-Table IV of the localisation paper: the soft arm's rings one by one.
-
-Pooled over all conditions of Table III.
-"""
+"""Table IV of the localisation paper: the soft arm's rings, over all conditions of Table III."""
 
 from __future__ import annotations
 

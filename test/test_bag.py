@@ -1,8 +1,4 @@
-"""
-Bags: everything of the contract is written and read back.
-
-Damaged and foreign bags are named.
-"""
+"""Bags: the whole contract is written and read back; damaged and foreign bags are named."""
 
 import re
 

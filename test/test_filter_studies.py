@@ -1,8 +1,4 @@
-"""
-The filter's studies judge as they say, and faults do what they are called.
-
-Times off, recovery, culprits, honesty.
-"""
+"""The filter's studies judge as they say, and faults do what they are called."""
 
 from dataclasses import replace
 import json

@@ -1,8 +1,4 @@
-"""
-Maps: sampling is blue noise with exact normals, and files lose nothing.
-
-Planarity is what the paper defines.
-"""
+"""Maps: blue noise with exact normals, the planarity of the paper, files that lose nothing."""
 
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.build import DENSITY, local_shape, map_from_cloud, sample_mesh

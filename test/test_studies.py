@@ -1,8 +1,4 @@
-"""
-Campaigns lose no trial and repeat none; the split is kept.
-
-Benchmarks and tuning judge as they say.
-"""
+"""Campaigns lose no trial and repeat none; split, benchmarks and tuning judge as they say."""
 
 from dataclasses import replace
 import json

@@ -1,7 +1,5 @@
 """
-What differs between the prior map and what was measured (paper, VI-C.4, eq. 12).
-
-New things, and missing ones.
+New and missing things: where measurements differ from the prior map (paper, VI-C.4, eq. 12).
 
 A *new* point is one whose squared Mahalanobis distance to the nearest map point exceeds tau. A map
 point stands for

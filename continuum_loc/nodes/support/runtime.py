@@ -114,9 +114,9 @@ class PackageNode(Node):
 
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     """
-    Make a node and spin it until it finishes or is told to stop.
+    Make a node, spin it until it finishes or is told to stop, and return the exit code.
 
-    Returns the exit code (2: bad input).
+    The code is 0, or 2 where something that was given cannot be used.
     """
     _provide_log_folder()
     try:
@@ -190,9 +190,9 @@ def _provide_log_folder() -> None:
 
 def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
     """
-    Best effort hears reliable and best-effort publishers alike.
+    Quality of service of an input: best effort hears every publisher.
 
-    The depth bridges a slow moment.
+    The depth of its queue bridges a slow moment of the node.
     """
     reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=reliability)
