@@ -254,14 +254,14 @@ class Intake:
 
     def counts(self) -> dict[str, Any]:
         """Give all that was counted, as a summary file holds it."""
+        refusals: dict[str, dict[str, Any]] = {}
+        for (topic, kind), (count, first) in sorted(self.refusals.items()):
+            refusals.setdefault(topic, {})[kind] = {'count': count, 'first': first}
         return {
             'received': dict(self.received),
             'used': dict(self.used),
             'refused': dict(self.refused),
-            'refusals': [
-                {'topic': topic, 'kind': kind, 'count': count, 'first': first}
-                for (topic, kind), (count, first) in sorted(self.refusals.items())
-            ],
+            'refusals': refusals,
             'restarts': self.gate.restarts,
             'failures': self.failures,
             'tof_status': {
