@@ -312,10 +312,10 @@ def repair(
     with _busy() as status:
         status.update('reading what is whole')
         done = save_whole(bag, out)
-    _count_table(done.saved, f'{out}: {done.saved.total():,} messages over {done.seconds:.1f} s')
-    for line in done.lost or ['nothing that was written is lost']:
-        console.print(line, highlight=False)
-    console.print('what its recorder had not written yet is not in it', highlight=False)
+    _count_table(done.saved, '')
+    said = f'{out}: {done.saved.total():,} messages over {done.seconds:.1f} s'
+    for line in (said, *done.lost, 'what its recorder had not yet written is not in it'):
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 @app.command()

@@ -114,7 +114,7 @@ class BagWriter:
         with suppress(OSError):  # it still tries to write what it could not
             storage.bio.close()
         with self._failing():
-            left = close_cut(storage.path)
+            left, self._writer.max_timestamp = close_cut(storage.path)
         self.counts = Counter({topic: left[self._name(topic)] for topic in self.counts})
         names = {connection.id: connection.topic for connection in self._connections.values()}
         self._writer.counts = {number: left[name] for number, name in names.items()}

@@ -60,7 +60,9 @@ class Survivors:
                 self.left_over = end - place
                 yield from self._messages(code, content, whole)
 
-    def _messages(self, code: int, content: bytes, whole: bool) -> Iterator:
+    def _messages(
+        self, code: int, content: bytes, whole: bool, span: tuple[int, int] = (0, 2**64)
+    ) -> Iterator:
         try:
             if code == CHUNK:
                 yield from self._unpacked(content, whole)
@@ -74,13 +76,15 @@ class Survivors:
                 self._channels[number] = Channel(topic.decode(), kind, text, metadata)
             elif whole and code == MESSAGE:
                 number, _, logged = unpack_from('<HIQ', content)
+                if not span[0] <= logged <= span[1]:
+                    raise ValueError('a message logged at another time than its chunk says')
                 yield self._channels[number], logged, content[22:]
         except Exception:  # what unpackers and decoders say of damaged bytes has no common kind
             self.damaged += 1
 
     def _unpacked(self, content: bytes, whole: bool) -> Iterator:
         """Messages of a chunk; of the last one, which may be cut, as many as there are."""
-        size, crc = unpack_from('<QI', content, 16)
+        begin, end, size, crc = unpack_from('<QQQI', content)
         (packing,) = _strings(content, 28, 1)
         data = content[28 + 4 + len(packing) + 8 :]
         if size > LARGEST_CHUNK:
@@ -89,8 +93,8 @@ class Survivors:
         if whole and (len(data) != size or (crc and crc32(data) != crc)):
             raise ValueError('a chunk that is not what its checksum says')
         for code, inner, _, complete in records(BytesIO(data), begin=0):
-            if complete:
-                yield from self._messages(code, inner, whole=True)
+            if complete and code != CHUNK:  # none in another
+                yield from self._messages(code, inner, True, (begin, end))
 
 
 def records(stream: BinaryIO, begin: int = len(MAGIC)) -> Iterator[tuple[int, bytes, int, bool]]:
@@ -114,12 +118,13 @@ def records(stream: BinaryIO, begin: int = len(MAGIC)) -> Iterator[tuple[int, by
             return
 
 
-def close_cut(path: Path) -> Counter[str]:
+def close_cut(path: Path) -> tuple[Counter[str], int]:
     """
-    End a file after its last whole record, so that it can be read; the messages left, by topic.
+    End a file after its last whole record, so that it can be read.
 
-    Works on a full disk: the end takes 50 bytes, for which records are given up where need be.
-    Raises OSError where that fails too.
+    Returns the messages left, by topic, and the log time of the last one [ns]. Works on a full
+    disk: the end takes 50 bytes, for which records are given up where need be. Raises OSError
+    where that fails too.
     """
     with path.open('rb') as stream:
         data = takewhile(lambda record: record[0] != DATA_END, records(stream))
@@ -133,7 +138,12 @@ def close_cut(path: Path) -> Counter[str]:
         except OSError:
             if not ends:
                 raise
-    return Counter(channel.topic for channel, *_ in Survivors(path))
+    counts: Counter[str] = Counter()
+    last = 0
+    for channel, logged, _ in Survivors(path):
+        counts[channel.topic] += 1
+        last = max(last, logged)
+    return counts, last
 
 
 def _strings(content: bytes, place: int, count: int) -> list[bytes]:

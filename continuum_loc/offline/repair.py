@@ -50,7 +50,9 @@ def repair(bag: Path, out: Path) -> Repaired:
     found = ((channel, at, data) for file in files for channel, at, data in _whole(file, done))
     first = next(found, None)
     if first is None:
-        raise BagError(f'{bag}: holds no whole message; {"; ".join(done.lost) or "it is empty"}')
+        raise BagError(
+            f'{bag}: holds no whole message; {"; ".join(done.lost) or "it is empty, or of another kind"}'
+        )
     _write(out, first, found, done)
     return done
 
@@ -87,7 +89,10 @@ def _whole(file: Path, done: Repaired) -> Iterator[tuple[Channel, int, bytes]]:
     if survivors.damaged:
         done.lost.append(f'{file.name}: {survivors.damaged} damaged records')
     if survivors.left_over:
-        done.lost.append(f'{file.name}: its last {survivors.left_over:,} bytes are cut off')
+        done.lost.append(
+            f'{file.name}: the last record is cut off after {survivors.left_over:,} bytes; what is '
+            'whole in it was saved'
+        )
 
 
 def _connect(writer: Any, channel: Channel) -> Any:

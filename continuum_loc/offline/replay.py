@@ -225,7 +225,8 @@ class _Log:
         self.estimates: list[Estimate] = []
         self.frames: list[TofFrame] = []
         self.step_seconds: list[float] = []
-        self.processing_seconds = self.cpu_seconds = self.data_seconds = 0.0
+        self.processing_seconds = self.cpu_seconds = 0.0
+        self.data_time = 0  # ns
         self.suspicion = Suspicion()
         self.restart()
 
@@ -237,7 +238,7 @@ class _Log:
     def received(self, sample: Measurement) -> None:
         first, last = self._span or (sample.stamp, sample.stamp)
         self._span = min(first, sample.stamp), max(last, sample.stamp)
-        self.data_seconds += seconds(self._span[1] - self._span[0], last - first)
+        self.data_time += (self._span[1] - self._span[0]) - (last - first)
         if isinstance(sample, TofFrame) and sample.stamp >= self._next_frame.get(sample.sensor, 0):
             self.frames.append(sample)
             self._next_frame[sample.sensor] = sample.stamp + CLOUD_PERIOD
@@ -266,7 +267,7 @@ class _Log:
             consistency=np.array([latest[stamp] for stamp in sorted(latest)], float),
             step_seconds=np.array(self.step_seconds),
             processing_seconds=self.processing_seconds,
-            data_seconds=self.data_seconds,
+            data_seconds=seconds(self.data_time),
             cloud=place_points(self.frames, track, self.robot),
             counts={**counts, 'suspects': self.suspicion.table()},
             cpu_seconds=self.cpu_seconds,
