@@ -4,17 +4,20 @@ The command line `continuum-loc`.
 Each command reads its arguments and calls the library; work is done there. It imports what it
 needs itself, so that `--help` takes a tenth of a second.
 
-Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input.
+Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input, or input of which
+nothing, or no measurement of a whole kind of sensor, could be used.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import json
 from pathlib import Path
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
-from continuum_loc.errors import ContinuumLocError, InputError, StudyError
+from continuum_loc.errors import ContinuumLocError, InputError, MapError, StudyError
 from rich.console import Console
 from rich.markup import escape
 import typer
@@ -55,6 +58,11 @@ Runs = Annotated[Path, typer.Option('--out', help='folder of the numbered runs')
 Settings = Annotated[
     Path | None, typer.Option(help='estimator settings (YAML); default: those of the robot')
 ]
+Namespace = Annotated[
+    str, typer.Option(help='whose topics, where the bag holds several robots; `/` for none')
+]
+Prefix = Annotated[str, typer.Option(help="what stands before the robot's frame names in the bag")]
+Strict = Annotated[bool, typer.Option('--strict', help='end at the first unusable message')]
 
 
 def main() -> None:
@@ -91,10 +99,7 @@ def demo(
         outcome = run_demo(
             Trial(robot, scene, trajectory, seed=seed, duration=duration), out, status.update
         )
-    console.print(_run_table(outcome.summary))
-    console.print(
-        f'report  [link=file://{outcome.folder}/report.html]{outcome.folder}/report.html[/link]'
-    )
+    unusable = _tell(outcome.folder, outcome.summary)
     console.print(f'bag     {outcome.bag}')
     for claim in outcome.claims:
         if not claim.holds:  # a slow machine is no failure of the demo; two different replays are
@@ -108,6 +113,7 @@ def demo(
     console.print(
         'replay  two replays of the bag without ROS gave the same estimate, to the last bit'
     )
+    raise typer.Exit(USAGE if unusable else OK)
 
 
 @app.command()
@@ -183,55 +189,64 @@ def replay(
     robot: Robot = 'engine',
     map_file: MapFile = None,
     scene: Annotated[
-        str,
-        typer.Option(
-            help='scene shown in the report, and whose map is taken where `--map` is not given'
-        ),
-    ] = 'S0',
+        str | None,
+        typer.Option(help='scene that is shown in the report, and whose map replaces `--map`'),
+    ] = None,
     settings: Settings = None,
+    namespace: Namespace = '',
+    frame_prefix: Prefix = '',
+    strict: Strict = False,
     seed: Seed = 0,
     out: Runs = Path('runs'),
 ) -> None:
     """
     Localise from a recorded bag without a ROS graph.
 
-    The same bag gives the same estimate, bit for bit.
+    The same bag gives the same estimate, bit for bit. What cannot be used of it is counted and
+    told at the end, and the rest is used.
 
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
     from continuum_loc.estimator import settings_of
     from continuum_loc.mapping.map_files import load_map
     from continuum_loc.offline.replay import replay as run_replay
-    from continuum_loc.offline.replay import samples_of
     from continuum_loc.offline.runs import new_run, save_run
     from continuum_loc.offline.trials import make_filter, scene_map_file
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
+    chosen = settings_of(description.name, settings)
+    if map_file is None and scene is None and description.tof and chosen.tof.enabled:
+        raise MapError(
+            f"robot '{description.name}' has ToF sensors, which need a prior map: give `--map "
+            'FILE`, or `--scene NAME` for the map of a scene of the simulator'
+        )
     with _busy() as status:
         status.update('loading the prior map')
-        map_file = map_file or scene_map_file(scene)
-        estimator = make_filter(
-            description, load_map(map_file), settings_of(description.name, settings)
+        if map_file is None and scene is not None:
+            map_file = scene_map_file(scene)
+        prior = None if map_file is None else load_map(map_file)
+        estimator = make_filter(description, prior, chosen)
+    with _bar('replaying', _bag_duration(bag)) as progress:
+        result = run_replay(
+            bag,
+            estimator,
+            namespace=namespace,
+            frame_prefix=frame_prefix,
+            strict=strict,
+            progress=progress,
         )
-    result = run_replay(_progress(samples_of(bag), 'replaying', _bag_duration(bag)), estimator)
+    configuration = {
+        'robot': description,
+        'bag': bag,
+        'map': {} if map_file is None else {'file': map_file},
+        'scene': scene,
+        'estimator': estimator.settings,
+    }
     folder = new_run('replay', out)
-    summary = save_run(
-        folder,
-        result,
-        kind='replay',
-        seed=seed,
-        configuration={
-            'robot': description,
-            'bag': bag,
-            'map': {'file': map_file},
-            'scene': scene,
-            'estimator': estimator.settings,
-        },
-    )
+    summary = save_run(folder, result, kind='replay', seed=seed, configuration=configuration)
     _write_report(folder)
-    console.print(_run_table(summary))
-    console.print(f'report  {folder}/report.html')
+    raise typer.Exit(USAGE if _tell(folder, summary) else OK)
 
 
 @app.command()
@@ -241,6 +256,9 @@ def shape(
     settings: Annotated[
         Path | None, typer.Option(help="shape settings (YAML); default: the package's")
     ] = None,
+    namespace: Namespace = '',
+    frame_prefix: Prefix = '',
+    strict: Strict = False,
     out: Runs = Path('runs'),
 ) -> None:
     """
@@ -251,7 +269,6 @@ def shape(
     Example: `continuum-loc shape bench_top.mcap --robot my_arm.yaml`
     """
     from continuum_loc.offline.replay import replay as run_replay
-    from continuum_loc.offline.replay import samples_of
     from continuum_loc.offline.runs import new_run, save_run
     from continuum_loc.offline.shape_replay import ShapeReplay
     from continuum_loc.robot import load_robot
@@ -259,18 +276,46 @@ def shape(
 
     description = load_robot(robot)
     estimator = ShapeReplay(description, load_shape_settings(settings))
-    result = run_replay(_progress(samples_of(bag), 'estimating', _bag_duration(bag)), estimator)
+    with _bar('estimating', _bag_duration(bag)) as progress:
+        result = run_replay(
+            bag,
+            estimator,
+            namespace=namespace,
+            frame_prefix=frame_prefix,
+            strict=strict,
+            progress=progress,
+        )
+    configuration = {'robot': description, 'bag': bag, 'estimator': estimator.settings}
     folder = new_run('shape', out)
-    summary = save_run(
-        folder,
-        result,
-        kind='shape',
-        seed=None,
-        configuration={'robot': description, 'bag': bag, 'estimator': estimator.settings},
-    )
+    summary = save_run(folder, result, kind='shape', seed=None, configuration=configuration)
     _write_report(folder)
-    console.print(_run_table(summary))
-    console.print(f'report  {folder}/report.html')
+    raise typer.Exit(USAGE if _tell(folder, summary) else OK)
+
+
+@app.command()
+def repair(
+    bag: Annotated[Path, typer.Argument(help='bag folder or file that cannot be read')],
+    out: Annotated[
+        Path | None, typer.Argument(help='new bag folder; default: `BAG_repaired`')
+    ] = None,
+) -> None:
+    """
+    Save what is whole of a bag that was cut off: its recorder was killed, or its disk was full.
+
+    The bag itself stays as it is.
+
+    Example: `continuum-loc repair bag_20260101_120000`
+    """
+    from continuum_loc.offline.repair import repair as save_whole
+
+    out = out or bag.with_name(f'{bag.stem if bag.is_file() else bag.name}_repaired')
+    with _busy() as status:
+        status.update('reading what is whole')
+        done = save_whole(bag, out)
+    _count_table(done.saved, '')
+    said = f'{out}: {done.saved.total():,} messages over {done.seconds:.1f} s'
+    for line in (said, *done.lost, 'what its recorder had not yet written is not in it'):
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -302,6 +347,8 @@ def tune(
     from continuum_loc.settings import dump_settings
     from rich.progress import Progress
 
+    if bag is not None and map_file is None:
+        raise MapError('a bag of your own needs the map of its place: give `--map FILE` too')
     description = load_robot(robot)
     start = settings_of(description.name, settings)
     with (
@@ -606,6 +653,29 @@ def _write_report(folder: Path) -> Path:
         return write_report(run, context_of(run))
 
 
+def _tell(folder: Path, summary: dict[str, Any]) -> bool:
+    """Say what a run gave, on one screen; whether nothing could be used of it, or of a sensor."""
+    from continuum_loc.offline.account import account_lines
+
+    if summary['poses']:
+        console.print(_run_table(summary))
+    else:
+        estimates = summary['estimates']
+        console.print(
+            f'{estimates["all"]} estimates ({estimates["tracking"]} tracking, '
+            f'{estimates["initialising"]} initialising, {estimates["lost"]} lost), none judged: '
+            f'no truth; {_speed(summary)}',
+            highlight=False,
+        )
+    for line in account_lines(summary['account']):
+        style = 'bold red' if line.startswith('PROBLEM') else ''
+        console.print(escape(line), style=style, highlight=False)
+    console.print(
+        f'report  [link=file://{folder.absolute()}/report.html]{folder}/report.html[/link]'
+    )
+    return bool(summary['account']['problems'])
+
+
 def _run_table(summary: dict[str, Any]) -> Any:
     """Print the short table at the end of a run: one line per ring, then speed."""
     from rich.table import Table
@@ -685,8 +755,9 @@ def _busy() -> Any:
     return errors.status('')
 
 
-def _progress(samples: Any, label: str, seconds: float | None) -> Any:
-    """Pass samples on, with a bar over the time that their stamps span."""
+@contextmanager
+def _bar(label: str, seconds: float | None) -> Iterator[Callable[[float], None]]:
+    """Show a bar; gives what is to be told the time of the data [s] that was reached."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -696,13 +767,24 @@ def _progress(samples: Any, label: str, seconds: float | None) -> Any:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=errors, transient=True) as progress:
-        task, first, shown = progress.add_task(label, total=seconds), None, 0.0
-        for sample in samples:
-            first = sample.stamp if first is None else first
-            elapsed = (sample.stamp - first) * 1e-9
+        task, shown = progress.add_task(label, total=seconds), 0.0
+
+        def tell(elapsed: float) -> None:
+            nonlocal shown
             if elapsed - shown > 0.1:
                 shown = elapsed
                 progress.update(task, completed=shown)
+
+        yield tell
+
+
+def _progress(samples: Any, label: str, seconds: float | None) -> Any:
+    """Pass samples on, with a bar over the time that their stamps span."""
+    first = None
+    with _bar(label, seconds) as tell:
+        for sample in samples:
+            first = sample.stamp if first is None else first
+            tell((sample.stamp - first) * 1e-9)
             yield sample
 
 

@@ -78,6 +78,9 @@ class NoisyFilter:
     def flush(self):
         return None
 
+    def reset(self):
+        """Nothing of the past is kept."""
+
     def _estimate(self, stamp: int, lagged: bool = True) -> Estimate:
         true = truth_at(self.robot, stamp)
         growth = (

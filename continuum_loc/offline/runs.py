@@ -17,9 +17,11 @@ import re
 from typing import Any
 
 from continuum_loc.errors import RunError
+from continuum_loc.offline.account import account_of
 from continuum_loc.offline.claims import plain, versions, write_json
 from continuum_loc.offline.metrics import Errors, errors, longest_stretch, summarise
 from continuum_loc.offline.replay import Cloud, ReplayResult
+from continuum_loc.robot import RobotDescription
 from continuum_loc.trajectory import associate, save_tum, Trajectory
 import numpy as np
 import yaml
@@ -82,13 +84,18 @@ def save_run(
     """
     Write the run's files (all but the report) and return its summary.
 
-    `extra` adds keys to the summary.
+    configuration: everything that the run was made from; the account in the summary asks for
+    `robot` and `estimator` in it. `extra` adds keys to the summary.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    found = summary_of(result)
+    robot, settings = (configuration.get(name) for name in ('robot', 'estimator'))
+    if isinstance(robot, RobotDescription) and 'intake' in result.counts:
+        found['account'] = account_of(robot, settings, result.counts, found)
     summary = {
         'kind': kind,
-        **summary_of(result),
+        **found,
         **(extra or {}),
         'seed': seed,
         'versions': versions(),
@@ -132,6 +139,9 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
                 for name in ('initialising', 'tracking', 'lost')
             },
         },
+        'consistency': float(np.median(result.consistency))
+        if len(result.consistency)
+        else float('nan'),
         'counts': result.counts,
         'digest': result.digest,
     }

@@ -32,6 +32,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 
 BAD_INPUT = 2
@@ -45,6 +46,7 @@ class PackageNode(Node):
     def __init__(self, name: str, defaults: Settings, **options: Any) -> None:
         super().__init__(name, **options)
         self.finished = Future()
+        self.failure: Exception | None = None
         self.settings = declare(self, defaults)
         self._guarded = False
 
@@ -52,6 +54,27 @@ class PackageNode(Node):
         """End the spin of this node (from any thread)."""
         if not self.finished.done():
             self.finished.set_result(None)
+
+    def fail(self, error: Exception) -> None:
+        """End the node with an error (from any thread); the first one counts."""
+        self.failure = self.failure or error
+        self.finish()
+
+    def thread(self, work: Callable[[], None], name: str) -> threading.Thread:
+        """
+        Make a thread whose failure is the node's, which ends then with an error.
+
+        A node that lives on without one of its threads is deaf or mute, and nobody knows.
+        """
+
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:
+                if self.context.ok():  # else it is the end that surfaces, as any of rclpy's errors
+                    self.fail(error)
+
+        return threading.Thread(target=guarded, name=name, daemon=True)
 
     def close(self) -> None:
         """Stop threads, write files. Called once, after the last callback."""
@@ -124,7 +147,7 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     except RCLError as error:  # arguments after --ros-args that ROS does not understand
         print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
-    node: PackageNode | None = None
+    node, failure = None, None
     try:
         node = make()
         _spin(node)
@@ -132,15 +155,23 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         pass
     except Exception as error:
         # A signal may surface as any of rclpy's errors, from a publish in flight for instance.
-        if rclpy.ok():
-            return _complain(error)
+        failure = error if rclpy.ok() else None
     finally:
         _ignore_signals()
         if node is not None:
-            node.close()
-            node.destroy_node()
+            failure = _closed(node, failure or node.failure)
         rclpy.try_shutdown()
-    return 0
+    return 0 if failure is None else _complain(failure)
+
+
+def _closed(node: PackageNode, failure: Exception | None) -> Exception | None:
+    """Close a node that has failed or not; what went wrong, first."""
+    try:
+        node.close()
+    except Exception as error:
+        failure = failure or error
+    node.destroy_node()
+    return failure
 
 
 def _spin(node: PackageNode) -> None:
@@ -186,6 +217,11 @@ def _provide_log_folder() -> None:
     """rclpy.init fails where it finds no place for logs, as in a container without HOME."""
     if not any(os.environ.get(name) for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR')):
         os.environ['ROS_LOG_DIR'] = tempfile.gettempdir()
+
+
+def deserialized(data: bytes, type_name: str) -> Any:
+    """Return the rclpy message of a type such as `sensor_msgs/msg/Imu` that was taken raw."""
+    return deserialize_message(data, ros_messages().resolve(type_name))
 
 
 def input_qos(topic: Topic, reliable: bool) -> QoSProfile:

@@ -139,6 +139,15 @@ class RecorderNodeSettings(Settings):
     summary_file: str = Field(
         '', description='JSON file of message counts, written at the end; empty for none'
     )
+    largest_message: int = Field(
+        32_000_000, ge=1_000, description='a longer message is dropped [bytes]'
+    )
+    queue_messages: int = Field(
+        100_000, ge=100, description='most messages that wait to be written; others are dropped'
+    )
+    queue_bytes: int = Field(
+        256_000_000, ge=1_000_000, description='most bytes that wait to be written'
+    )
 
 
 class ReplayerNodeSettings(Settings):
@@ -190,6 +199,7 @@ class DriverNodeSettings(Settings):
     core_radius: float = Field(
         35e-6, gt=0.0, description="distance of the outer cores from the fibre's axis [m]"
     )
+    longest_line: int = Field(65_536, ge=256, description='a longer line is refused [bytes]')
 
 
 class ViewerNodeSettings(Settings):
