@@ -38,7 +38,7 @@ _CORE = (
     ),
     ('merge', r'<<', ['<']),
 )
-_OCTAL_TO_ROS = re.compile(r'[-+]?0[0-7]+')
+OCTAL = 'ROS reads a number that begins with 0 as octal; leave the leading 0 out'
 
 
 class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):
@@ -161,14 +161,15 @@ def check_parameter_file(path: str | Path) -> None:
     try:
         root = _composed(read_text(path))
         for node in _scalars(root):
-            if node.style is None and _OCTAL_TO_ROS.fullmatch(node.value):
-                raise _problem(
-                    node,
-                    f'{node.value}: ROS reads a number that begins with 0 as octal, as '
-                    f'{int(node.value, 8)}; leave the leading 0 out',
-                )
+            if not node.style and is_octal(node.value):
+                raise _problem(node, f'{node.value}: {OCTAL}')
     except yaml.YAMLError as error:
         raise SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+
+
+def is_octal(text: str) -> bool:
+    """Tell whether ROS takes a plain text for an octal number."""
+    return re.fullmatch(r'[-+]?0[0-7]+', text) is not None
 
 
 def _composed(text: str) -> yaml.Node | None:
