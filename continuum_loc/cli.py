@@ -10,7 +10,7 @@ nothing, or no measurement of a whole kind of sensor, could be used.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 import json
 from pathlib import Path
@@ -50,9 +50,7 @@ Robot = Annotated[
 Scene = Annotated[
     str, typer.Option(help='`S0`-`S9`, `R0`-`R4`, or your own mesh (STL, OBJ, PLY; metres)')
 ]
-MapFile = Annotated[
-    Path | None, typer.Option('--map', help='prior map: .npz .ply .pcd .xyz .csv, or a mesh')
-]
+MapFile = Annotated[Path | None, typer.Option('--map', help='prior map: .npz, a cloud or a mesh')]
 Seed = Annotated[int, typer.Option(help='seed of everything random')]
 Runs = Annotated[Path, typer.Option('--out', help='folder of the numbered runs')]
 Settings = Annotated[
@@ -208,7 +206,7 @@ def replay(
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
     from continuum_loc.estimator import settings_of
-    from continuum_loc.mapping.map_files import load_map
+    from continuum_loc.mapping.scale import map_for
     from continuum_loc.offline.replay import replay as run_replay
     from continuum_loc.offline.runs import new_run, save_run
     from continuum_loc.offline.trials import make_filter, scene_map_file
@@ -225,8 +223,10 @@ def replay(
         status.update('loading the prior map')
         if map_file is None and scene is not None:
             map_file = scene_map_file(scene)
-        prior = None if map_file is None else load_map(map_file)
+        prior = None if map_file is None else map_for(description, map_file)
         estimator = make_filter(description, prior, chosen)
+    if prior is not None:
+        _say(map_file, prior.notes)
     with _bar('replaying', _bag_duration(bag)) as progress:
         result = run_replay(
             bag,
@@ -340,6 +340,7 @@ def tune(
     import tempfile
 
     from continuum_loc.estimator.settings import settings_of
+    from continuum_loc.mapping.scale import map_for
     from continuum_loc.offline.trials import scene_map_file, simulate, write_bag
     from continuum_loc.offline.tune import FACTORS, hold_out, PARAMETERS
     from continuum_loc.offline.tune import tune as sweep
@@ -351,6 +352,8 @@ def tune(
         raise MapError('a bag of your own needs the map of its place: give `--map FILE` too')
     description = load_robot(robot)
     start = settings_of(description.name, settings)
+    if map_file is not None:
+        _say(map_file, map_for(description, map_file).notes)
     with (
         tempfile.TemporaryDirectory() as scratch,
         Progress(console=errors, transient=True) as progress,
@@ -515,10 +518,12 @@ def _evaluate_bags(
     folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path, jobs: int
 ) -> list[Claim]:
     from continuum_loc.estimator.settings import settings_of
+    from continuum_loc.mapping.scale import map_for
     from continuum_loc.offline.bags import evaluate_bags
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
+    _say(map_file, map_for(description, map_file).notes)
     return evaluate_bags(
         folder, description, map_file, settings_of(description.name, settings), out, jobs
     )
@@ -607,15 +612,27 @@ def map_convert(
         tuple[float, float, float] | None,
         typer.Option(help='a place that the surface is seen from, for clouds without normals'),
     ] = None,
+    scale: Annotated[
+        float, typer.Option(help='what lengths are multiplied by to be metres: 0.001 for mm')
+    ] = 1.0,
+    sigma: Annotated[
+        float | None,
+        typer.Option(help='standard deviation of a point [m]; default: what the file states'),
+    ] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help='distance of the points sampled from a mesh [m]')
+    ] = None,
 ) -> None:
     """
     Read a map in any known form and write it in another.
 
-    Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1`
+    The standard deviation is kept in `.npz` alone.
+
+    Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1 --sigma 0.002`
     """
     from continuum_loc.mapping.map_files import load_map
 
-    prior = load_map(source, viewpoint=viewpoint)
+    prior = load_map(source, viewpoint=viewpoint, scale=scale, sigma=sigma, spacing=spacing)
     prior.save(out)
     _describe_map(out, prior)
 
@@ -633,14 +650,26 @@ def map_info(file: Annotated[Path, typer.Argument(help='map file')]) -> None:
 
 
 def _describe_map(path: Path, prior: Any) -> None:
+    from continuum_loc.mapping.scale import size_note
+
     low, high = prior.points.min(axis=0), prior.points.max(axis=0)
     box = ' x '.join(f'{a:.2f}..{b:.2f}' for a, b in zip(low, high, strict=True))
     console.print(
-        f'{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, '
+        f'{escape(str(path))}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, '
+        f'in {box} m, sigma {1e3 * prior.sigma:.3g} mm, '
         f'mean planarity {prior.planarity.mean():.2f}, '
         f'normals {"outward" if prior.oriented else "of either sign"}',
         highlight=False,
     )
+    _say(path, (*prior.notes, *size_note(prior)))
+
+
+def _say(path: Path, notes: Iterable[str]) -> None:
+    """Print what there is to know about a file that was read."""
+    for note in notes:
+        errors.print(
+            f'[yellow]note:[/] {escape(f"{path}: {note}")}', highlight=False, soft_wrap=True
+        )
 
 
 def _write_report(folder: Path) -> Path:

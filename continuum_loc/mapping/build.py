@@ -26,17 +26,19 @@ def sample_mesh(
     region: tuple[np.ndarray, np.ndarray] | None = None,
     sigma: float = 1e-4,
     source: str = 'mesh',
+    notes: tuple[str, ...] = (),
 ) -> PriorMap:
     """
     Blue-noise points on a triangle mesh with the triangles' normals.
 
-    Normals point outward by the right-hand rule.
+    Normals point outward by the right-hand rule. Raises MapError for a mesh without area.
 
     vertices: (V, 3) [m]; faces: (F, 3). No two points on the same side of the surface are closer
     than `spacing` [m]; or give `count`, about as many points as wanted. The two sides of a thin
     part are sampled independently, and normals are the triangles' own: PCA mixes the sides of a
     thin blade up.
-    region: (lower, upper) corners of a box [m] to which the map is confined.
+    region: (lower, upper) corners of a box [m] to which the map is confined. source, notes: of
+    the map.
     """
     vertices, faces = _checked_mesh(vertices, faces, source)
     areas, normals = _triangle_areas_and_normals(vertices, faces)
@@ -59,7 +61,14 @@ def sample_mesh(
     points, normals = points[order], normals[triangle[order]]
     planarity, _ = local_shape(points, normals)
     return PriorMap(
-        points, normals, planarity, sigma=sigma, spacing=spacing, source=source, seed=seed
+        points,
+        normals,
+        planarity,
+        sigma=sigma,
+        spacing=spacing,
+        source=source,
+        seed=seed,
+        notes=notes,
     )
 
 
@@ -71,14 +80,14 @@ def map_from_cloud(
     viewpoint: np.ndarray | None = None,
     sigma: float = 1e-4,
     source: str = 'cloud',
+    notes: tuple[str, ...] = (),
 ) -> PriorMap:
     """
     Make a map from a measured cloud (P, 3) [m].
 
-    What is missing of normals (P, 3) and planarity (P,) comes from PCA.
-
-    PCA normals are turned toward `viewpoint` (3,) [m]; without one their sign means nothing and
-    the map says so.
+    What is missing of normals (P, 3) and planarity (P,) comes from PCA. PCA normals are turned
+    toward `viewpoint` (3,) [m]; without one their sign means nothing and the map says so. source,
+    notes: of the map.
     """
     points = _finite(points, 'points', source)
     oriented = normals is not None or viewpoint is not None
@@ -96,6 +105,7 @@ def map_from_cloud(
         spacing=_typical_spacing(points),
         oriented=oriented,
         source=source,
+        notes=notes,
     )
 
 

@@ -28,6 +28,7 @@ class PriorMap:
     sigma: standard deviation of a point [m] (Sigma_nn of eq. 12 is built from it and from
     `spacing`).
     spacing: typical distance from a point to its nearest neighbour [m].
+    notes: what was left out of the file that the map is from, or aside, in words.
     """
 
     points: np.ndarray
@@ -38,6 +39,7 @@ class PriorMap:
     oriented: bool = True
     source: str = ''
     seed: int | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         _require_columns(self)
@@ -128,6 +130,8 @@ def _refuse_rows(prior: PriorMap, bad: np.ndarray, rule: str) -> None:
 def _write_npz(prior: PriorMap, path: Path) -> None:
     arrays = {name: getattr(prior, name) for name in ('points', 'normals', 'planarity')}
     about = {key: value for key, value in asdict(prior).items() if key not in arrays}
+    if not prior.notes:  # so that versions without notes read most maps too
+        del about['notes']
     with path.open('wb') as stream:
         np.savez(stream, format=NPZ_FORMAT, about=json.dumps(about), **arrays)
 

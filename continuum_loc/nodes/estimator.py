@@ -247,9 +247,12 @@ class EstimatorNode(WorkerNode):
         if not self.settings.map:
             self.get_logger().warning('no prior map: ToF sensors cannot be used (parameter `map`)')
             return None
-        from continuum_loc.mapping.map_files import load_map
+        from continuum_loc.mapping.scale import map_for
 
-        return load_map(self.settings.map)
+        prior = map_for(self.robot, self.settings.map)
+        for note in prior.notes:
+            self.get_logger().warning(f'{self.settings.map}: {note}')
+        return prior
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:

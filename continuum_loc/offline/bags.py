@@ -13,6 +13,7 @@ from typing import Any
 from continuum_loc.errors import BagError
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
+from continuum_loc.mapping.scale import map_for
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, lost_share, ring_rows
 from continuum_loc.offline.parallel import (
@@ -85,7 +86,7 @@ def evaluate_bags(
     The one claim is that none failed. Raises BagError or MapError before any work.
     """
     trials = bag_trials(folder)
-    load_map(map_file)  # a map that cannot be read is no bag's fault
+    map_for(robot, map_file)  # a map that cannot be used is no bag's fault
     work = [(trial, robot, map_file, settings, out) for trial in trials]
     outcomes = sorted(
         show_progress(parallel(replay_bag, work, jobs), len(work), 'estimating'),

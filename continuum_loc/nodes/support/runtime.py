@@ -14,8 +14,9 @@ import tempfile
 import threading
 from typing import Any
 
-from continuum_loc.errors import ContinuumLocError
+from continuum_loc.errors import ContinuumLocError, SettingsError
 from continuum_loc.nodes.support.parameters import (
+    check_arguments,
     declare,
     guard,
     live_fields,
@@ -143,8 +144,9 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     """
     _provide_log_folder()
     try:
+        check_arguments(sys.argv if args is None else args)
         rclpy.init(args=args)
-    except RCLError as error:  # arguments after --ros-args that ROS does not understand
+    except (RCLError, SettingsError) as error:  # arguments that cannot be understood
         print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
     node, failure = None, None
