@@ -48,25 +48,30 @@ def normal_at(cosine: float) -> np.ndarray:
     return np.array([-cosine, 0.0, np.sqrt(1.0 - cosine**2)])
 
 
-def wall(distance: float, cosine: float = 1.0, sigma: float = 1e-9, planarity=None) -> PriorMap:
+def wall(
+    distance: float,
+    cosine: float = 1.0,
+    sigma: float = 1e-9,
+    planarity: tuple[float, float] = (1.0, 1.0),
+    reach: float = 0.3,
+) -> PriorMap:
     """
-    Map a wall through the point at `distance` before the tip.
+    Map a wall through the point at `distance` before the tip, `reach` [m] to every side.
 
     planarity: (of the wall, of a second one 20 m behind that has twice as many points).
     """
     n = normal_at(cosine)
     across, up = np.array([0.0, 1.0, 0.0]), np.array([n[2], 0.0, -n[0]])
-    ticks = np.arange(-0.3, 0.301, 0.02)
+    ticks = np.linspace(-reach, reach, 31)
     u, v = (x.reshape(-1, 1) for x in np.meshgrid(ticks, ticks))
     points = np.array([LENGTH + distance, 0.0, 0.0]) + u * across + v * up
-    own, other = (1.0, 1.0) if planarity is None else planarity
     behind = np.tile(points + np.array([20.0, 0.0, 0.0]), (2, 1)) + np.repeat(
         [[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]], len(points), axis=0
     )
     return PriorMap(
         points=np.concatenate([points, behind]),
         normals=np.tile(n, (3 * len(points), 1)),
-        planarity=np.repeat([own, other], [len(points), 2 * len(points)]),
+        planarity=np.repeat(planarity, [len(points), 2 * len(points)]),
         sigma=sigma,
     )
 
