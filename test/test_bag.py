@@ -80,6 +80,21 @@ def test_the_same_samples_give_the_same_file(tmp_path):
     assert first == second
 
 
+def test_a_bag_logs_under_the_stamp_of_its_item_or_the_one_given(tmp_path):
+    """What other programs see of the bag, to the nanosecond; the message keeps its own stamp."""
+    late = 7 * SECOND + 123_456_789
+    with BagWriter(tmp_path / 'b') as writer:
+        writer.write('imu/data_raw', _imu(3 * SECOND + 1))
+        writer.write('tof/points', _tof(4 * SECOND + 2))
+        writer.write('imu/data_raw', _imu(5 * SECOND), stamp=late)
+    with open_bag(tmp_path / 'b') as reader:
+        logged = [stamp for _, stamp, _ in reader.messages()]
+        span = reader.start_time, reader.end_time
+    assert logged == [3 * SECOND + 1, 4 * SECOND + 2, late]
+    assert span == (3 * SECOND + 1, late + 1)  # rosbags ends it after the last message
+    assert [item.stamp for _, item in read_bag(tmp_path / 'b')][-1] == 5 * SECOND
+
+
 def test_publishers_of_the_contract_are_recorded_with_explicit_qos(tmp_path):
     """`ros2 bag play` offers what the bag states: the map must come out latched again."""
     from rosbags.interfaces import QosDurability, QosReliability
