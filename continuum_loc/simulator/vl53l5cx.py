@@ -331,17 +331,18 @@ def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndar
     There are up to eight round it.
     """
     rows, columns = signal.shape[1:]
-    margin = ((0, 0), (1, 1), (1, 1))
-    padded = np.pad(signal, margin), np.pad(depth, margin)
-    shifts = [
-        (slice(r, r + rows), slice(c, c + columns))
-        for r in range(3)
-        for c in range(3)
-        if (r, c) != (1, 1)
-    ]
-    around = [np.stack([grid[:, down, across] for down, across in shifts]) for grid in padded]
-    brightest = np.argmax(around[0], axis=0)[None]
-    return tuple(np.take_along_axis(grid, brightest, axis=0)[0] for grid in around)
+    signals = np.zeros((len(signal), rows + 2, columns + 2))
+    depths = signals.copy()
+    signals[:, 1:-1, 1:-1], depths[:, 1:-1, 1:-1] = signal, depth
+    best_signal, best_depth = np.full(signal.shape, -1.0), np.zeros(signal.shape)
+    for row in range(3):
+        for column in range(3):
+            if (row, column) != (1, 1):
+                there = np.s_[:, row : row + rows, column : column + columns]
+                brighter = signals[there] > best_signal
+                best_signal = np.where(brighter, signals[there], best_signal)
+                best_depth = np.where(brighter, depths[there], best_depth)
+    return best_signal, best_depth
 
 
 @njit(cache=True)

@@ -237,7 +237,8 @@ class World:
         pose = self._posed(self.robot.tof)
 
         def sample(stamp: int, time: float) -> list:
-            return model.measure(pose(time), names, stamp, body_capsules=self._capsules(time))
+            body = self._capsules(self.motion.pose(time))
+            return model.measure(pose(time), names, stamp, body_capsules=body)
 
         return _Stream(self.robot.tof_model.rate, sample)
 
@@ -262,17 +263,20 @@ class World:
         self, model: TofSensorModel, sensor: Sensor, readout: Readout
     ) -> Callable[[int, float], Iterable[Any]]:
         """Make the sampling of one ToF sensor: of an exposure comes what is read out then."""
-        pose, names = self._posed((sensor,)), [sensor.name]
+        (node,), mount = self._mounts((sensor,))
 
         def sample(stamp: int, time: float) -> Iterator[Any]:
-            frame = model.measure(pose(time), names, stamp, body_capsules=self._capsules(time))[0]
-            return readout.take(frame)
+            nodes = self.motion.pose(time)
+            frames = model.measure(
+                nodes[node] @ mount, [sensor.name], stamp, self._capsules(nodes)
+            )
+            return readout.take(frames[0])
 
         return sample
 
-    def _capsules(self, time: float) -> np.ndarray:
+    def _capsules(self, T_map_node: np.ndarray) -> np.ndarray:
         """(M, 7) ends and radius of the body's pieces, as `raycast.cast_capsules` takes them."""
-        points = self.motion.pose(time)[:, :3, 3]
+        points = T_map_node[:, :3, 3]
         return np.column_stack(
             [points[:-1], points[1:], np.full(len(points) - 1, self.robot.radius)]
         )
