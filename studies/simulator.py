@@ -421,12 +421,6 @@ def _mechanism_claims(found: dict[str, float]) -> Iterator[Claim]:
         '',
         1.0,
     )
-    yield at_most(
-        'VL53L5CX status 12 away from bright neighbours: share of zones',
-        found['falsely drowned'],
-        '',
-        0.0,
-    )
 
 
 # -------------------------------------------------------------------------- motion, contact, speed
