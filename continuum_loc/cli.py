@@ -212,7 +212,7 @@ def replay(
     from continuum_loc.offline.trials import make_filter, scene_map_file
     from continuum_loc.robot import load_robot
 
-    description = load_robot(robot)
+    description, duration = load_robot(robot), _bag_duration(bag)
     chosen = settings_of(description.name, settings)
     if map_file is None and scene is None and description.tof and chosen.tof.enabled:
         raise MapError(
@@ -227,7 +227,7 @@ def replay(
         estimator = make_filter(description, prior, chosen)
     if prior is not None:
         _say(map_file, prior.notes)
-    with _bar('replaying', _bag_duration(bag)) as progress:
+    with _bar('replaying', duration) as progress:
         result = run_replay(
             bag,
             estimator,
@@ -795,7 +795,8 @@ def _bar(label: str, seconds: float | None) -> Iterator[Callable[[float], None]]
         TextColumn('{task.completed:.1f} s'),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=errors, transient=True) as progress:
+    quiet = not errors.is_terminal  # a file gets no bar, and no empty line for one
+    with Progress(*columns, console=errors, transient=True, disable=quiet) as progress:
         task, shown = progress.add_task(label, total=seconds), 0.0
 
         def tell(elapsed: float) -> None:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import threading
 from typing import Any, TypeVar
 
-from continuum_loc.errors import MessageError
+from continuum_loc.errors import MeasurementError, MessageError
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -183,17 +183,17 @@ class Intake:
 
         None where it is refused.
         """
-        most = self.settings.largest_message
-        if len(data) > most:
-            self.refuse('size', f'{topic}: a message of {len(data)} bytes; valid: {most}', topic)
-            return None
-        kind = topic_spec(topic).type
+        kind, most = topic_spec(topic).type, self.settings.largest_message
         try:
-            return read(data, kind)
+            if len(data) <= most:
+                return read(data, kind)
+            wrong = 'size', f'{topic}: a message of {len(data)} bytes; valid: {most}'
         except Exception as error:  # libraries state no closed set of errors for damaged bytes
-            text = f'{topic}: not a {kind} ({type(error).__name__}: {str(error)[:100]})'
-            self.refuse('bytes', text, topic)
-            return None
+            said = f'{type(error).__name__}: {str(error)[:100]}'
+            wrong = 'bytes', f'{topic}: not a {kind} ({said})'
+        self.received[topic] += 1
+        self.refuse(*wrong, topic)
+        return None
 
     def accept(self, topic: str, message: Any, arrival: int) -> Measurement | None:
         """
@@ -228,19 +228,22 @@ class Intake:
         return sample
 
     def attempt(self, action: Callable[[], T], what: str) -> T | None:
-        """Do `action`; a failure on what it was given is counted, and the estimate starts anew."""
+        """
+        Do `action` on what came from `what`.
+
+        A measurement that cannot be used is refused. Any other failure is counted, and the
+        estimate starts anew.
+        """
         try:
             return action()
+        except MeasurementError as error:
+            self.refuse(error.reason, f'{what}: {error}', what)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
             self.failures += 1
-            self.refuse(
-                'failure',
-                f'the estimator failed on {what} ({type(error).__name__}: {error}) '
-                'and starts anew',
-                what,
-            )
+            said = f'{type(error).__name__}: {error}'
+            self.refuse('failure', f'the estimator failed on {what}, starting anew ({said})', what)
             self.restart()
-            return None
+        return None
 
     def refuse(self, kind: str, text: str, topic: str = '', count: int = 1) -> None:
         """Count an error, and report the first of its class."""

@@ -195,11 +195,20 @@ def read_bag(
 
 
 def raw_messages(
-    path: str | Path, topics: tuple[str, ...] | None = None, namespace: str | None = None
+    path: str | Path,
+    topics: tuple[str, ...] | None = None,
+    namespace: str | None = None,
+    mistyped: Callable[[str, int, str], None] = lambda topic, count, text: None,
 ) -> Iterator[tuple[str, int, bytes]]:
-    """(relative topic, log time in ns, serialised message) of a bag, selected as by `read_bag`."""
+    """
+    (relative topic, log time in ns, serialised message) of a bag, selected as by `read_bag`.
+
+    mistyped: told of inputs by name that are of another type, which are left out.
+    """
     path = Path(path)
     with open_bag(path) as reader:
+        for stranger in _mistyped(reader.connections, namespace):
+            mistyped(*stranger)
         names = contract_topics(path, reader.connections, namespace)
         wanted = [
             c for c in reader.connections if c.topic in names and _selected(names[c.topic], topics)
@@ -280,24 +289,18 @@ def contract_topics(path: Path, connections: list, namespace: str | None) -> dic
     raise BagError(f'{path}: {said}; choose one by its namespace: {listed}')
 
 
-def mistyped_inputs(path: Path, namespace: str | None = None) -> dict[str, tuple[int, str]]:
+def _mistyped(connections: list, namespace: str | None) -> Iterator[tuple[str, int, str]]:
     """
-    Find inputs by name that are none by type.
+    Find inputs of one robot by name that are none by type.
 
-    How many messages, and what is wrong, by relative topic.
-    namespace: only of this robot, where it is given.
+    Yields (relative topic, how many messages, what is wrong).
     """
-    found = {}
-    under = f'/{namespace.strip("/")}/' if namespace and namespace.strip('/') else '/'
-    with open_bag(path) as reader:
-        for c in reader.connections:
-            for name in INPUTS:
-                expected = topic_spec(name).type
-                named = c.topic.startswith(under) and c.topic.endswith(f'/{name}')
-                if named and c.msgtype != expected:
-                    text = f'{c.topic}: of type {c.msgtype}; the contract says {expected}'
-                    found[name] = c.msgcount, text
-    return found
+    root = f'/{namespace.strip("/")}/' if namespace and namespace.strip('/') else '/'
+    for c in connections:
+        name = next((name for name in INPUTS if c.topic.endswith(f'/{name}')), '')
+        if name and c.topic.startswith(root) and c.msgtype != TOPICS[name].type:
+            expected = TOPICS[name].type
+            yield name, c.msgcount, f'{c.topic}: of type {c.msgtype}; the contract says {expected}'
 
 
 def split_topic(name: str, type_name: str) -> tuple[str, str] | None:

@@ -116,6 +116,10 @@ class Witness:
         """Pass the end on."""
         return self._note(self.watched.flush())
 
+    def reset(self) -> None:
+        """Pass a new start on."""
+        self.watched.reset()
+
     def _note(self, estimate: Estimate | None) -> Estimate | None:
         if estimate is not None:
             self.log.append(

@@ -70,7 +70,7 @@ def account_of(
         problems.append(f'no truth could be used: {truth["first"]}')
     if not summary['estimates']['all']:
         came = ', '.join(f'{row["received"]} {name}' for name, row in rows.items())
-        problems.insert(0, f'no estimate came out of {came or "no measurement in it"}')
+        problems.insert(0, f'no estimate: {came or "no measurement in it"}')
     return {
         'problems': problems,
         'topics': rows | ({TRUTH: truth} if truth['received'] else {}),

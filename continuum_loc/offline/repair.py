@@ -50,10 +50,8 @@ def repair(bag: Path, out: Path) -> Repaired:
     found = ((channel, at, data) for file in files for channel, at, data in _whole(file, done))
     first = next(found, None)
     if first is None:
-        raise BagError(
-            f'{bag}: holds no whole message; '
-            f'{"; ".join(done.lost) or "it is empty, or of another kind"}'
-        )
+        why = '; '.join(done.lost) or 'it is empty, or of another kind'
+        raise BagError(f'{bag}: holds no whole message; {why}')
     _write(out, first, found, done)
     return done
 
@@ -91,8 +89,8 @@ def _whole(file: Path, done: Repaired) -> Iterator[tuple[Channel, int, bytes]]:
         done.lost.append(f'{file.name}: {survivors.damaged} damaged records')
     if survivors.left_over:
         done.lost.append(
-            f'{file.name}: the last record is cut off after {survivors.left_over:,} bytes; '
-            'what is whole in it was saved'
+            f'{file.name}: the last record is cut off after {survivors.left_over:,} bytes; what '
+            'is whole in it was saved'
         )
 
 

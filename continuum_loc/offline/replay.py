@@ -163,13 +163,15 @@ def _recorded(
     progress: Callable[[float], None],
 ) -> Iterator:
     """(topic, sample) of a bag's messages that pass the gate."""
-    from msg_tools.bag import mistyped_inputs, raw_messages
+    from msg_tools.bag import raw_messages
 
-    for topic, (count, text) in mistyped_inputs(bag, namespace).items():
-        intake.received[topic] += count
-        intake.refuse('type', text, topic, count)
+    def mistyped(topic: str, count: int, text: str) -> None:
+        if topic in inputs:
+            intake.received[topic] += count
+            intake.refuse('type', text, topic, count)
+
     first = None
-    for topic, logged, data in raw_messages(bag, (*inputs, TRUTH), namespace):
+    for topic, logged, data in raw_messages(bag, (*inputs, TRUTH), namespace, mistyped):
         first = logged if first is None else first
         progress(seconds(logged, first))
         try:

@@ -210,8 +210,14 @@ class ViewerNodeSettings(Settings):
     )
     port: int = Field(8765, ge=0, le=65535, description='port to serve on; 0 takes a free one')
     map_points: int = Field(
-        20_000, ge=0, description='most map points that are sent to the browser'
+        20_000, ge=0, le=500_000, description='most map points that are sent to the browser'
     )
     cloud_points: int = Field(
-        5_000, ge=0, description='most reconstructed points that are sent to the browser'
+        5_000,
+        ge=0,
+        le=100_000,
+        description='most points of anything else that are sent to the browser',
+    )
+    largest_message: int = Field(
+        32_000_000, ge=1_000, description='a longer message is not shown [bytes]'
     )
