@@ -122,8 +122,7 @@ def read_yaml(path: str | Path) -> Document:
 
 def write_yaml(data: Any, path: str | Path) -> None:
     """Write plain data so that this reader, and one of YAML 1.1, read it back as it is."""
-    text = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-    Path(path).write_text(text, encoding='utf-8')
+    Path(path).write_text(yaml.dump(data, Dumper=_Dumper, sort_keys=False), encoding='utf-8')
 
 
 def read_text(path: Path) -> str:

@@ -137,7 +137,7 @@ def _point_count(said: dict[str, list[str]], where: str) -> int:
 
 
 def _number(text: str, what: str, least: int = 0) -> int:
-    if not re.fullmatch(r'\d{1,18}', text) or int(text) < least:
+    if not re.fullmatch(r'\d{1,20}', text) or int(text) < least:
         raise MapError(f"{what} '{text[:40]}'; valid is a whole number from {least} on")
     return int(text)
 

@@ -151,7 +151,7 @@ def _take(words: list[str], order: str | None, elements: list[_Element]) -> str 
     match words:
         case ['format', name, '1.0'] if order is None:
             return _ORDER[name]
-        case ['element', name, count] if re.fullmatch(r'\d{1,18}', count):
+        case ['element', name, count] if re.fullmatch(r'\d{1,20}', count):
             elements.append(_Element(name, int(count)))
         case ['property', 'list', length, kind, name] if _TYPES[length][0] != 'f':
             elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
