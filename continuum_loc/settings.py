@@ -128,7 +128,7 @@ def parse_settings(
     except ValidationError as error:
         lines = [
             f'{where}: {_explain(model, item)}{_in_line(line_of(item["loc"]))}'
-            for item in error.errors()
+            for item in _causes(error.errors())
         ]
         raise SettingsError('\n'.join(lines)) from None
 
@@ -136,6 +136,20 @@ def parse_settings(
 def dump_settings(settings: Settings, path: str | Path) -> None:
     """Write settings as YAML that `load_settings` reads back to an equal object."""
     write_yaml(settings.model_dump(mode='json'), path)
+
+
+def _causes(items: list[dict]) -> list[dict]:
+    """Leave out that a list is too short, where that is so because of its refused items."""
+    return [
+        item
+        for item in items
+        if item['type'] != 'too_short'
+        or not any(_is_inside(other['loc'], item['loc']) for other in items)
+    ]
+
+
+def _is_inside(place: tuple, outer: tuple) -> bool:
+    return len(place) > len(outer) and place[: len(outer)] == outer
 
 
 def _in_line(number: int | None) -> str:

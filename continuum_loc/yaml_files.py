@@ -117,15 +117,12 @@ def read_yaml(path: str | Path) -> Document:
         root = _composed(text)
         return Document(None if root is None else _constructed(root), root)
     except yaml.YAMLError as error:
-        raise SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
-    except RecursionError:  # of a parser that was compiled without libyaml
-        raise SettingsError(f'{path}: nested too deep; at most {DEEPEST} levels') from None
+        raise _refusal(path, error) from None
 
 
 def write_yaml(data: Any, path: str | Path) -> None:
     """Write plain data so that this reader, and one of YAML 1.1, read it back as it is."""
-    text = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-    Path(path).write_text(text, encoding='utf-8')
+    Path(path).write_text(yaml.dump(data, Dumper=_Dumper, sort_keys=False), encoding='utf-8')
 
 
 def read_text(path: Path) -> str:
@@ -164,7 +161,7 @@ def check_parameter_file(path: str | Path) -> None:
             if not node.style and is_octal(node.value):
                 raise _problem(node, f'{node.value}: {OCTAL}')
     except yaml.YAMLError as error:
-        raise SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+        raise _refusal(path, error) from None
 
 
 def is_octal(text: str) -> bool:
@@ -247,5 +244,15 @@ def _constructed(root: yaml.Node) -> Any:
         loader.dispose()
 
 
-def _problem(where: Any, text: str) -> yaml.YAMLError:
-    return yaml.YAMLError(f'line {where.start_mark.line + 1}: {text}')
+class _Problem(yaml.YAMLError):
+    """What is valid YAML, and not for us."""
+
+
+def _problem(where: Any, text: str) -> _Problem:
+    return _Problem(f'line {where.start_mark.line + 1}: {text}')
+
+
+def _refusal(path: Path, error: yaml.YAMLError) -> SettingsError:
+    if isinstance(error, _Problem):
+        return SettingsError(f'{path}, {error}')
+    return SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}')

@@ -13,6 +13,7 @@ from continuum_loc.mapping.voxel_index import VoxelIndex
 import numpy as np
 
 CLOUD_COLUMNS = ('x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity')
+FARTHEST = 1e9  # m: of a coordinate; squares and cubes of it can still be computed with
 NPZ_FORMAT = 'continuum_loc prior map 1'
 
 
@@ -50,6 +51,11 @@ class PriorMap:
         _refuse_rows(self, ~np.isfinite(self.points).all(axis=1), 'points must be finite')
         _refuse_rows(
             self,
+            np.abs(self.points).max(axis=1) > FARTHEST,
+            f'points must be within {FARTHEST:g} m of 0',
+        )
+        _refuse_rows(
+            self,
             ~(np.abs(np.linalg.norm(self.normals, axis=1) - 1.0) < 1e-6),
             'normals must have length 1',
         )
@@ -58,9 +64,9 @@ class PriorMap:
             ~((self.planarity >= 0.0) & (self.planarity <= 1.0)),
             'planarity must lie in [0, 1]',
         )
-        if not (self.sigma > 0.0 and self.spacing >= 0.0):
+        if not (0.0 < self.sigma < np.inf and 0.0 <= self.spacing < np.inf):
             raise MapError(
-                f'{self._name}: sigma must be > 0 and spacing >= 0, '
+                f'{self._name}: sigma must be > 0 and spacing >= 0, and both finite, '
                 f'got {self.sigma}, {self.spacing}'
             )
 

@@ -137,7 +137,7 @@ def _point_count(said: dict[str, list[str]], where: str) -> int:
 
 
 def _number(text: str, what: str, least: int = 0) -> int:
-    if not re.fullmatch(r'\d{1,18}', text) or int(text) < least:
+    if not re.fullmatch(r'\d{1,20}', text) or int(text) < least:
         raise MapError(f"{what} '{text[:40]}'; valid is a whole number from {least} on")
     return int(text)
 
@@ -160,7 +160,8 @@ def _viewpoint_notes(said: dict[str, list[str]], where: str) -> tuple[str, ...]:
 
 
 def _ascii(data: bytes, header: _Header, where: str) -> dict[str, np.ndarray]:
-    text = text_of(data[header.size :], where)
+    start = header.size
+    text = text_of(data[start:], where)
     lines = text.split('\n')
     kept = [k for k, line in enumerate(lines) if line.strip()]
     numbers = [header.lines + 1 + k for k in kept]
@@ -185,7 +186,8 @@ def _binary(data: bytes, header: _Header, where: str) -> dict[str, np.ndarray]:
         raise _ends(room // header.point_size, header, where)
     kind = np.dtype([(f'{k}', one.kind, (one.count,)) for k, one in enumerate(header.fields)])
     table = np.frombuffer(data, kind, header.points, header.size)
-    check_rest(data[header.size + table.nbytes :], where)
+    end = header.size + table.nbytes
+    check_rest(data[end:], where)
     return {one.name: table[f'{k}'][:, 0] for k, one in enumerate(header.fields)}
 
 
@@ -208,7 +210,8 @@ def _compressed(data: bytes, header: _Header, where: str) -> dict[str, np.ndarra
     written = _unpack_lzf(np.frombuffer(data, np.uint8, packed, start), content)
     if written != unpacked:
         raise MapError(f'{where}: its packed points are damaged')
-    check_rest(data[start + packed :], where)
+    end = start + packed
+    check_rest(data[end:], where)
     columns, place = {}, 0
     for one in header.fields:
         values = np.frombuffer(content, one.kind, header.points * one.count, place)
@@ -238,7 +241,8 @@ def _unpack_lzf(packed, content):
             length = control + 1
             if read + length > packed.size or written + length > content.size:
                 return -1
-            content[written : written + length] = packed[read : read + length]
+            for k in range(length):
+                content[written + k] = packed[read + k]
             read += length
             written += length
             continue

@@ -151,7 +151,7 @@ def _take(words: list[str], order: str | None, elements: list[_Element]) -> str 
     match words:
         case ['format', name, '1.0'] if order is None:
             return _ORDER[name]
-        case ['element', name, count] if re.fullmatch(r'\d{1,18}', count):
+        case ['element', name, count] if re.fullmatch(r'\d{1,20}', count):
             elements.append(_Element(name, int(count)))
         case ['property', 'list', length, kind, name] if _TYPES[length][0] != 'f':
             elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
@@ -287,15 +287,17 @@ def _gathered(rows: list[dict], element: _Element) -> _Rows:
 
 
 def _ascii(data: bytes, header: _Header, where: str) -> dict[str, _Rows]:
-    text = text_of(data[header.size :], where)
+    body_start = header.size
+    text = text_of(data[body_start:], where)
     lines = text.split('\n')
     numbers = [k for k, line in enumerate(lines) if line.strip()]
     rows, start = {}, 0
     for element in header.elements:
-        mine = numbers[start : start + element.count]
+        end = start + element.count
+        mine = numbers[start:end]
         if len(mine) < element.count:
             raise _ends(element, len(mine), where)
-        start += element.count
+        start = end
         body = [lines[k] for k in mine]
         on = [header.lines + 1 + k for k in mine]
         read = _ascii_plain if element.is_plain else _ascii_lists
@@ -341,11 +343,12 @@ def _ascii_row(words: list[str], properties: list[_Property]) -> dict | None:
             if one.length is not None:
                 count = int(words[place])
                 place += 1
-            given = words[place : place + count]
+            end = place + count
+            given = words[place:end]
             if count < 0 or len(given) < count:
                 return None
             row[one.name] = np.array([(float if one.type[0] == 'f' else int)(w) for w in given])
-            place += count
+            place = end
     except (ValueError, IndexError):
         return None
     return row if place == len(words) else None

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from continuum_loc.errors import MapError
+from continuum_loc.mapping.prior_map import FARTHEST
 import numpy as np
 
 NORMAL = ('nx', 'ny', 'nz')
@@ -81,6 +82,7 @@ def cloud_of(
     if len(points) == 0:
         raise MapError(f'{where}: holds no points')
     check_finite(points, 'points', where, place)
+    check_near(points, where, place)
     if normals is not None:
         check_finite(normals, 'normals', where, place)
         normals, left_aside = usable_normals(normals, where, place)
@@ -118,7 +120,8 @@ def usable_normals(
 
     Raises MapError where some have and others do not.
     """
-    length = np.linalg.norm(normals, axis=1)
+    with np.errstate(over='ignore'):
+        length = np.linalg.norm(normals, axis=1)
     unit = np.abs(length - 1.0) <= UNIT
     if unit.all():
         return normals, []
@@ -144,6 +147,16 @@ def check_finite(
         raise MapError(
             f'{where}: {len(bad)} of {len(rows)} {name} are not finite, the first is '
             f'number {bad[0]} ({place(int(bad[0]))}); remove them or repair the file'
+        )
+
+
+def check_near(points: np.ndarray, where: str, place: Callable[[int], str] = _counted) -> None:
+    """Refuse coordinates (N, 3) with which nothing can be computed."""
+    far = np.flatnonzero(np.abs(points).max(axis=1, initial=0.0) > FARTHEST)
+    if len(far):
+        raise MapError(
+            f'{where}: {len(far)} of {len(points)} points are more than {FARTHEST:g} from 0, the '
+            f'first is number {far[0]} ({place(int(far[0]))})'
         )
 
 
@@ -174,6 +187,7 @@ def mesh_of(vertices: np.ndarray, faces: np.ndarray, notes: list[str], where: st
     """Make a mesh of vertices (V, 3) that are finite and faces (F, 3) that name them."""
     vertices = vertices.astype(np.float64)
     check_finite(vertices, 'vertices', where)
+    check_near(vertices, where)
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise MapError(
             f'{where}: its faces name vertices {faces.min()} to {faces.max()} (counted from 0), '

@@ -211,9 +211,10 @@ def _meaning(
 
 def _six_or_seven(values, table, where):
     width = values.shape[1]
-    length = np.linalg.norm(values[:, 3:6], axis=1)
+    with np.errstate(over='ignore'):
+        length = np.linalg.norm(values[:, 3:6], axis=1)
     unit = np.abs(length - 1.0) <= UNIT
-    colours = _are_colours(values[:, width - 3 :], unit)
+    colours = _are_colours(values[:, [-3, -2, -1]], unit)
     if unit.all() and not colours:
         return list(OWN[:width]), []
     if colours:
@@ -228,8 +229,8 @@ def _six_or_seven(values, table, where):
 
 
 def _are_colours(values: np.ndarray, unit: np.ndarray) -> bool:
-    """Whole numbers from 0 to 255 that are not all 0 and 1, or fractions seldom of length 1."""
-    if values.min() < 0.0 or values.max() > 255.0:
+    """Whole numbers of up to 16 bits that are not all 0 and 1, or fractions seldom of length 1."""
+    if values.min() < 0.0 or values.max() > 65535.0:
         return False
     if (values == np.round(values)).all():
         return values.max() > 1.0
