@@ -75,7 +75,7 @@ class KernelCache(NullCache):
         return None if self._numba is None else self._numba.locator.get_cache_path()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load what was compiled for a signature from the same definitions; None: there is none."""
+        """Load what was compiled for a signature from the same definitions, or None."""
         if not self._enabled or self._numba is None:
             return None
         target_context.refresh()  # as numba does: it may not have been set up yet

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import hashlib
 import json
 from pathlib import Path
 import traceback
@@ -15,6 +14,7 @@ from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, lost_share, ring_rows
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.parallel import (
     configuration_digest,
     Outcome,
@@ -23,9 +23,8 @@ from continuum_loc.offline.parallel import (
 )
 from continuum_loc.offline.replay import replay, ReplayResult
 from continuum_loc.offline.runs import save_run
-from continuum_loc.offline.source import replay_digest
+from continuum_loc.offline.source import content_digest, replay_digest
 from continuum_loc.offline.study_report import write_study_report
-from continuum_loc.offline.trials import make_filter
 from continuum_loc.robot import RobotDescription
 
 BAG_SUFFIXES = ('.mcap', '.db3')
@@ -173,16 +172,6 @@ def require_estimates(result: ReplayResult, robot: RobotDescription) -> None:
         f"no estimate: {'; '.join(counted) or 'no measurement in it'}; robot '{robot.name}' has "
         f'the ToF sensors {", ".join(one.name for one in robot.tof) or "none"}'
     )
-
-
-def content_digest(path: Path) -> str:
-    """Digest a file, or all files in a folder, to the byte."""
-    digest = hashlib.sha256()
-    inside = sorted(each for each in path.rglob('*') if each.is_file())
-    for each in inside if path.is_dir() else [path]:
-        with each.open('rb') as stream:
-            digest.update(hashlib.file_digest(stream, 'sha256').digest())
-    return digest.hexdigest()
 
 
 def bag_rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
