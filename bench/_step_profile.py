@@ -16,7 +16,9 @@ from time import process_time
 
 from bench.harness import one_core
 from continuum_loc.estimator.settings import load_estimator_settings
-from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from matplotlib.figure import Figure
 

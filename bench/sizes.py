@@ -25,7 +25,8 @@ from continuum_loc.mapping.facing import PATIENCE
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame
-from continuum_loc.offline.trials import measured, scene_map, Trial
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np

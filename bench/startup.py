@@ -20,7 +20,8 @@ import tempfile
 import time
 
 from bench.harness import alone, one_core
-from continuum_loc.offline.trials import scene_map, simulate, Trial, write_bag
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import simulate, Trial, write_bag
 import numpy as np
 
 BOUNDS = [
@@ -29,7 +30,9 @@ BOUNDS = [
 ]
 
 _ESTIMATE = """
-from continuum_loc.offline.trials import Trial, make_filter, scene_map
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import Trial
 from continuum_loc.offline.replay import samples_of
 from continuum_loc.measurements import TruthSample
 from continuum_loc.robot import load_robot

@@ -26,7 +26,9 @@ from continuum_loc.estimator import gp
 from continuum_loc.estimator.chain import Blocks, Chain, Message, symmetric
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.estimator.state import NODE_DIM
-from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from numba import njit
 import numpy as np

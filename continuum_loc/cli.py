@@ -207,9 +207,10 @@ def replay(
     """
     from continuum_loc.estimator import settings_of
     from continuum_loc.mapping.scale import map_for
+    from continuum_loc.offline.localise import make_filter
     from continuum_loc.offline.replay import replay as run_replay
     from continuum_loc.offline.runs import new_run, save_run
-    from continuum_loc.offline.trials import make_filter, scene_map_file
+    from continuum_loc.offline.scene_maps import scene_map_file
     from continuum_loc.robot import load_robot
 
     description, duration = load_robot(robot), _bag_duration(bag)
@@ -341,7 +342,8 @@ def tune(
 
     from continuum_loc.estimator.settings import settings_of
     from continuum_loc.mapping.scale import map_for
-    from continuum_loc.offline.trials import scene_map_file, simulate, write_bag
+    from continuum_loc.offline.scene_maps import scene_map_file
+    from continuum_loc.offline.trials import simulate, write_bag
     from continuum_loc.offline.tune import FACTORS, hold_out, PARAMETERS
     from continuum_loc.offline.tune import tune as sweep
     from continuum_loc.robot import load_robot

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import math
 
+from continuum_loc.compiling import kernel
 from continuum_loc.lie import INVERSE_SERIES, LEFT_SERIES, SMALL_ANGLE
-from numba import njit
 import numpy as np
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _hat_into(out, row, column, x, y, z):
     """Write the skew matrix of (x, y, z) into the 3x3 block of `out` at (row, column)."""
     out[row, column] = 0.0
@@ -33,7 +33,7 @@ def _hat_into(out, row, column, x, y, z):
     out[row + 2, column + 2] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def ad(x, out):
     """Adjoint matrix of x (6,) in se(3), into out (6, 6)."""
     _hat_into(out, 0, 0, x[3], x[4], x[5])
@@ -42,7 +42,7 @@ def ad(x, out):
     out[3:, :3] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def bracket(x, y, out):
     """Out (6,) = ad(x) y."""
     out[0] = x[4] * y[2] - x[5] * y[1] + x[1] * y[5] - x[2] * y[4]
@@ -53,7 +53,7 @@ def bracket(x, y, out):
     out[5] = x[3] * y[4] - x[4] * y[3]
 
 
-@njit(cache=True)
+@kernel
 def block_product(A, B, out):
     """Out = A B for matrices of the form [[X, Y], [0, X]]."""
     for i in range(3):
@@ -69,7 +69,7 @@ def block_product(A, B, out):
             out[i + 3, j] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def product(A, B, out):
     """Out (6, 6) = A B."""
     for i in range(6):
@@ -80,7 +80,7 @@ def product(A, B, out):
             out[i, j] = total
 
 
-@njit(cache=True)
+@kernel
 def apply(A, x, out):
     """Out (6,) = A x."""
     for i in range(6):
@@ -90,7 +90,7 @@ def apply(A, x, out):
         out[i] = total
 
 
-@njit(cache=True)
+@kernel
 def exp(x, T):
     """Exponential of x, into T (4, 4)."""
     a, b, c = x[3], x[4], x[5]
@@ -123,7 +123,7 @@ def exp(x, T):
     T[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def log(T, x):
     """
     Logarithm of T, into x (6,), angle in [0, pi].
@@ -163,7 +163,7 @@ def log(T, x):
     x[5] = h
 
 
-@njit(cache=True)
+@kernel
 def relative(Ta, Tb, out):
     """Out (4, 4) = Ta^-1 Tb."""
     for i in range(3):
@@ -178,7 +178,7 @@ def relative(Ta, Tb, out):
     out[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def compose(Ta, Tb, out):
     """Out (4, 4) = Ta Tb; `out` must not be one of them."""
     for i in range(3):
@@ -189,7 +189,7 @@ def compose(Ta, Tb, out):
     out[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def adjoint(T, out):
     """Out (6, 6) = Ad(T)."""
     for j in range(3):
@@ -202,7 +202,7 @@ def adjoint(T, out):
         out[2, j + 3] = T[0, 3] * T[1, j] - T[1, 3] * T[0, j]
 
 
-@njit(cache=True)
+@kernel
 def _taylor(series, square, value, slope):
     """Value of the Taylor polynomials in phi^2 and their derivative by phi, divided by phi."""
     for row in range(series.shape[0]):
@@ -215,7 +215,7 @@ def _taylor(series, square, value, slope):
         slope[row] = 2.0 * derivative
 
 
-@njit(cache=True)
+@kernel
 def right_coefficients(x, c, dc):
     """C (5,): J_r(x) = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
@@ -238,7 +238,7 @@ def right_coefficients(x, c, dc):
     c[1], c[3], dc[1], dc[3] = -c[1], -c[3], -dc[1], -dc[3]
 
 
-@njit(cache=True)
+@kernel
 def right_inverse_coefficients(x, c, dc):
     """
     Coefficients c (5,) of J_r(x)^-1 = sum c_i ad(x)^i, and dc (5,).
@@ -264,7 +264,7 @@ def right_inverse_coefficients(x, c, dc):
         dc[4] = ((dslope - dh) / (square * square) - 4.0 * c[4] / f) / f
 
 
-@njit(cache=True)
+@kernel
 def polynomial(c, A, out, work):
     """
     Out = c0 I + c1 A + (c2 I + c3 A + c4 A^2) A^2: two products.
@@ -284,7 +284,7 @@ def polynomial(c, A, out, work):
         out[i, i] += c[0]
 
 
-@njit(cache=True)
+@kernel
 def polynomial_times(c, dc, x, A, w, value, derivative, work, vectors):
     """
     Value (6,) = f(A) w and derivative (6, 6) = d(f(ad(x)) w)/dx for f(A) = sum c_i A^i, A = ad(x).
@@ -319,7 +319,7 @@ def polynomial_times(c, dc, x, A, w, value, derivative, work, vectors):
             derivative[i, j] += rank_one * x[j]
 
 
-@njit(cache=True)
+@kernel
 def _subtract_ad(D, x):
     """D -= ad(x)."""
     for offset in (0, 3):
@@ -337,7 +337,7 @@ def _subtract_ad(D, x):
     D[2, 4] -= x[0]
 
 
-@njit(cache=True)
+@kernel
 def pose_error(T_wanted, T, e, J, W, V, M):
     """Write e (6,) = Log(T_wanted^-1 T) and its Jacobian J (6, 6) by T; W, V, M a workspace."""
     relative(T_wanted, T, M[0])
@@ -347,7 +347,7 @@ def pose_error(T_wanted, T, e, J, W, V, M):
     polynomial(V[0], W[0], J, W[1:3])
 
 
-@njit(cache=True)
+@kernel
 def workspace():
     """
     Scratch that the functions above and the interpolation share.

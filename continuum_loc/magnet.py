@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+from continuum_loc.compiling import kernel
 from continuum_loc.lie import hat
 from continuum_loc.robot import Magnet
-from numba import njit
 import numpy as np
 
 MU_0 = 4e-7 * math.pi
@@ -119,7 +119,7 @@ def invert_dipole(magnet: Magnet, field: np.ndarray) -> np.ndarray:
     return np.array([invert_dipole_once(k, row) for row in rows]).reshape(field.shape)
 
 
-@njit(cache=True)
+@kernel
 def invert_dipole_once(k, field):
     """`invert_dipole` of one field (3,), for k = mu_0 M / 4 pi."""
     sign = 1.0 if k > 0.0 else -1.0
@@ -138,7 +138,7 @@ def invert_dipole_once(k, field):
     return distance * np.array([cosine, sine * cy, sine * cz])
 
 
-@njit(cache=True)
+@kernel
 def _field_batch(parameters, points):
     field = np.empty_like(points)
     gradient = np.empty((points.shape[0], 3, 3))
@@ -147,7 +147,7 @@ def _field_batch(parameters, points):
     return field, gradient
 
 
-@njit(cache=True)
+@kernel
 def evaluate_field(parameters, p, field, gradient):
     """
     Field and gradient at one point, in the magnet's frame.
@@ -160,7 +160,7 @@ def evaluate_field(parameters, p, field, gradient):
         _ring(parameters[1], parameters[2], parameters[3], parameters[4], p, field, gradient)
 
 
-@njit(cache=True)
+@kernel
 def _dipole(k, p, field, gradient):
     """B = k (3 p x - r^2 e_x) / r^5, and its gradient."""
     r2 = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
@@ -176,7 +176,7 @@ def _dipole(k, p, field, gradient):
     field[0] -= scale * r2
 
 
-@njit(cache=True)
+@kernel
 def _ring(strength, half_length, inner, outer, p, field, gradient):
     rho = math.sqrt(p[1] * p[1] + p[2] * p[2])
     radial, axial, radial_slope, axial_slope = _sheet(outer, half_length, rho, p[0])
@@ -203,7 +203,7 @@ def _ring(strength, half_length, inner, outer, p, field, gradient):
     gradient[1, 2] = gradient[2, 1] = strength * (outward - per_rho) * cy * cz
 
 
-@njit(cache=True)
+@kernel
 def _sheet(a, half_length, rho, x):
     """B_rho, B_x, dB_rho/dx, dB_x/dx of a unit current sheet (remanence / pi = 1), radius a."""
     gamma = (a - rho) / (a + rho)
@@ -223,7 +223,7 @@ def _sheet(a, half_length, rho, x):
     return radial, axial, radial_slope, axial_slope
 
 
-@njit(cache=True)
+@kernel
 def _cel(kc, p, c, s):
     """
     Bulirsch's complete elliptic integral.

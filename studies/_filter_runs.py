@@ -14,17 +14,20 @@ import re
 import traceback
 from typing import Any
 
+from continuum_loc.closure import is_ours
 from continuum_loc.estimate import Estimate
 from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import Measurement, NANOSECONDS, nanoseconds, TruthSample
-from continuum_loc.offline.claims import Claim, write_json
+from continuum_loc.offline.as_json import write_json
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.metrics import Errors, errors
 from continuum_loc.offline.replay import Filter, replay, samples_of
 from continuum_loc.offline.runs import load_run, Run, save_run
+from continuum_loc.offline.scene_maps import scene_map_file
 from continuum_loc.offline.source import replay_digest
-from continuum_loc.offline.tables import markdown
-from continuum_loc.offline.trials import configuration, make_filter, scene_map_file, Trial
+from continuum_loc.offline.trial_runs import configuration
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.faults import Fault
@@ -165,7 +168,7 @@ def _replay(out: Path, case: Case, folder: Path) -> None:
     trial, settings = case.trial, case_settings(case)
     resolved = configuration(trial, estimator=settings, case=case, faults=repr(case.faults))
     bag, map_file = bag_of(out, trial), scene_map_file(trial.map_scene or trial.scene)
-    key = configuration_digest(resolved, replay_digest(), made_by(bag), map_file.name)
+    key = configuration_digest(resolved, code_of(case), made_by(bag), map_file.name)
     if _digest(folder) == key:
         return
     witness = Witness(make_filter(load_robot(trial.robot), load_map(map_file), settings))
@@ -180,6 +183,12 @@ def _replay(out: Path, case: Case, folder: Path) -> None:
         extra={'case_digest': key},
     )
     write_json(folder / 'diagnostics.json', witness.log)
+
+
+def code_of(case: Case) -> str:
+    """Digest the code that decides a case: kinds of faults may come from any module of ours."""
+    kinds = {type(fault).__module__ for fault in case.faults}
+    return replay_digest(__name__, *sorted(name for name in kinds if is_ours(name)))
 
 
 def _digest(folder: Path) -> str | None:
@@ -278,32 +287,3 @@ def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
 def failures(results: Sequence[CaseResult]) -> dict[str, str]:
     """List the cases that gave nothing, and why."""
     return {result.case.folder: result.error for result in results if result.run is None}
-
-
-def write_page(
-    out: Path,
-    title: str,
-    text: str,
-    claims: Sequence[Claim],
-    tables: dict[str, Sequence[dict[str, Any]]],
-) -> Path:
-    """Write `out/study.md`: the explanation, the claims (those that fail first) and the tables."""
-    import pandas as pd
-
-    rows = [
-        {
-            'claim': claim.name,
-            'value': f'{claim.value:.4g} {claim.unit}'.strip(),
-            'bound': claim.bound,
-            'holds': claim.holds,
-        }
-        for claim in sorted(claims, key=lambda claim: claim.holds)
-    ]
-    parts = [f'# {title}', text, '## Claims', markdown(pd.DataFrame(rows))]
-    for name, table in tables.items():
-        if not table:
-            continue
-        parts += [f'## {name}', markdown(pd.DataFrame(list(table)))]
-    path = out / 'study.md'
-    path.write_text('\n\n'.join(part.rstrip() for part in parts) + '\n')
-    return path

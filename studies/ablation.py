@@ -16,8 +16,8 @@ from studies._filter_runs import (
     longest_unannounced,
     run_cases,
     settled_since,
-    write_page,
 )
+from studies._pages import write_page
 from studies.support.split import HOLD_OUT, require_unseen
 
 NO_STRAIN = {'strain': {'enabled': False}}

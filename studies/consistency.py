@@ -18,7 +18,7 @@ from continuum_loc.offline.runs import load_run, settled
 from continuum_loc.offline.trials import Trial
 from continuum_loc.trajectory import Trajectory
 import numpy as np
-from studies._filter_runs import write_page
+from studies._pages import write_page
 from studies.support.campaign import run_campaign
 from studies.support.split import HOLD_OUT, require_unseen
 

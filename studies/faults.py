@@ -10,18 +10,16 @@ A fault lasts from START for LENGTH seconds. Each case is judged beside the same
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from continuum_loc.measurements import TofFrame
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.faults import ClockOffset, Dropout, Fault, Freeze, Outliers
 import numpy as np
-from scipy.spatial.transform import Rotation
 from studies._filter_runs import (
     Case,
     CaseResult,
@@ -29,8 +27,9 @@ from studies._filter_runs import (
     OFF,
     run_cases,
     settled_since,
-    write_page,
 )
+from studies._pages import write_page
+from studies._turned import Turned
 from studies.support.split import require_unseen
 
 START, LENGTH, AFTER = 8.0, 2.0, 3.0  # s
@@ -38,24 +37,6 @@ QUICK_START = 1.5  # s
 BACK = 1.0  # s: the limit for being back to normal
 NORMAL_MARGIN = 1.25
 CLEAN = 'no fault'
-
-
-@dataclass(frozen=True, kw_only=True)
-class Turned(Fault):
-    """
-    A ToF sensor knocked out of its mount.
-
-    Its points belong `angle_deg` away, about its z axis, from where the robot description puts
-    them.
-    """
-
-    angle_deg: float = 20.0
-
-    def alter(self, sample, rng, memory):
-        if not isinstance(sample, TofFrame):
-            return sample
-        turn = Rotation.from_euler('z', self.angle_deg, degrees=True)
-        return replace(sample, points=turn.apply(sample.points))
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,8 @@ import subprocess
 import sys
 
 from continuum_loc.errors import StudyError
-from continuum_loc.offline.claims import (
-    at_least,
-    at_most,
-    between,
-    Claim,
-    plain,
-    write_study,
-)
+from continuum_loc.offline.as_json import plain
+from continuum_loc.offline.claims import at_least, at_most, between, Claim, write_study
 import pytest
 from studies import load_study
 

@@ -98,11 +98,46 @@ def test_results_of_other_code_are_not_taken(done, tmp_path, monkeypatch, change
         'bag': campaign.bag_of(tmp_path, trials[0]) / 'metadata.yaml',
     }
     before = {name: path.stat().st_mtime_ns for name, path in files.items()}
-    monkeypatch.setattr(campaign, changed, lambda: 'of other code')
+    monkeypatch.setattr(campaign, changed, lambda *entries: 'of other code')
     run_campaign(trials[:1], tmp_path)
     assert {name for name, path in files.items() if path.stat().st_mtime_ns != before[name]} == (
         renewed
     )
+
+
+def test_a_robot_that_was_edited_is_recorded_anew(tmp_path):
+    from continuum_loc.robot import ROBOTS_FOLDER
+
+    robot = tmp_path / 'mine.yaml'
+    text = (ROBOTS_FOLDER / 'soft_arm.yaml').read_text()
+    robot.write_text(text)
+    trial = Trial(str(robot), 'R0', 'b1', 'R0', plant='soft_arm', seed=3, duration=0.2)
+    assert campaign.record_bags([trial], tmp_path) == {}
+    bag = campaign.bag_of(tmp_path, trial)
+    assert campaign.recorded(bag, trial)
+    robot.write_text(text + '\n# measured again\n')
+    assert not campaign.recorded(bag, trial)
+
+
+def test_another_recording_in_the_same_place_is_estimated_anew(done, tmp_path):
+    out, trials, _ = done
+    bag = campaign.bag_of(tmp_path, trials[0])
+    shutil.copytree(campaign.bag_of(out, trials[0]), bag)
+    (bag / campaign.MADE_BY).unlink()
+    before = campaign.made_by(bag)
+    (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text() + '\n')
+    assert campaign.made_by(bag) != before
+
+
+def test_different_trials_of_one_name_are_refused(tmp_path):
+    for folder in ('a', 'b'):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / 'mine.yaml').write_text(folder)
+    one, other = (Trial(str(tmp_path / folder / 'mine.yaml')) for folder in ('a', 'b'))
+    with pytest.raises(StudyError, match='two different trials are called'):
+        run_campaign([one, other], tmp_path)
+    with pytest.raises(StudyError, match='recorded as'):
+        campaign.record_bags([one, other], tmp_path)
 
 
 def test_a_recording_that_somebody_put_there_is_taken(done, tmp_path, monkeypatch):

@@ -43,6 +43,7 @@ class EstimatorNode(WorkerNode):
         self.filter_settings = parameters.declare(self, self._preset(), FILTER)
         self.check_parameters()
         self.prior_map = self._load_map()
+        self.get_logger().info('compiling, or loading what an earlier run compiled')
         self.filter = self._new_filter(self.robot)
         self.estimate: Estimate | None = None
         self.recent = RecentPoses(self.settings.trajectory_seconds)
@@ -256,7 +257,6 @@ class EstimatorNode(WorkerNode):
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:
-            self.get_logger().info('compiling, or loading what an earlier run compiled')
             warm_up(self.robot, self.prior_map, self.filter_settings, self.scene)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import hashlib
 import json
 from pathlib import Path
 import traceback
@@ -17,6 +16,7 @@ from continuum_loc.mapping.scale import map_for
 from continuum_loc.offline.account import account_of
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, lost_share, ring_rows
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.parallel import (
     configuration_digest,
     Outcome,
@@ -25,9 +25,8 @@ from continuum_loc.offline.parallel import (
 )
 from continuum_loc.offline.replay import replay
 from continuum_loc.offline.runs import save_run, summary_of
-from continuum_loc.offline.source import replay_digest
+from continuum_loc.offline.source import content_digest, replay_digest
 from continuum_loc.offline.study_report import write_study_report
-from continuum_loc.offline.trials import make_filter
 from continuum_loc.robot import RobotDescription
 from msg_tools.bag import BAG_SUFFIXES
 
@@ -161,16 +160,6 @@ def _summary(
         },
         extra={'configuration_digest': key},
     )
-
-
-def content_digest(path: Path) -> str:
-    """Digest a file, or all files in a folder, to the byte."""
-    digest = hashlib.sha256()
-    inside = sorted(each for each in path.rglob('*') if each.is_file())
-    for each in inside if path.is_dir() else [path]:
-        with each.open('rb') as stream:
-            digest.update(hashlib.file_digest(stream, 'sha256').digest())
-    return digest.hexdigest()
 
 
 def bag_rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:

@@ -16,12 +16,15 @@ from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import TofFrame
 from continuum_loc.offline.account import account_of
 from continuum_loc.offline.claims import at_least, at_most, Claim
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.metrics import errors, summarise
 from continuum_loc.offline.replay import place_points, ReplayResult, samples_of
 from continuum_loc.offline.replay import replay as run_replay
 from continuum_loc.offline.report import context_of, write_report
 from continuum_loc.offline.runs import distribution, load_run, new_run, save_run, summary_of
-from continuum_loc.offline.trials import configuration, make_filter, scene_map_file, Trial
+from continuum_loc.offline.scene_maps import scene_map_file
+from continuum_loc.offline.trial_runs import configuration
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.trajectory import BASE, Trajectory
 import numpy as np

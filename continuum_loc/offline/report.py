@@ -95,7 +95,7 @@ def context_of(run: Run) -> Context:
     """Find the scene and the prior map that the run's configuration names, if they still are."""
     from continuum_loc.errors import MapError, SceneError
     from continuum_loc.mapping.map_files import load_map
-    from continuum_loc.offline.trials import scene_map
+    from continuum_loc.offline.scene_maps import scene_map
     from continuum_loc.simulator.scenes import load_scene
 
     mesh = map_points = None

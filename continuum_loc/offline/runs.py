@@ -19,7 +19,7 @@ from typing import Any
 from continuum_loc.errors import RunError
 from continuum_loc.npz_files import read_arrays
 from continuum_loc.offline.account import account_of
-from continuum_loc.offline.claims import plain, versions, write_json
+from continuum_loc.offline.as_json import plain, versions, write_json
 from continuum_loc.offline.metrics import Errors, errors, longest_stretch, summarise
 from continuum_loc.offline.replay import Cloud, ReplayResult
 from continuum_loc.robot import RobotDescription

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.grid import AXIS_BITS, find_slot, pack
 from continuum_loc.scene.splat_cast import next_cell, start_march
-from numba import njit
 import numpy as np
 
 
@@ -38,7 +38,7 @@ def passes(
     return counts
 
 
-@njit(cache=True)
+@kernel
 def _insert(slots, cells):
     for c in range(cells.shape[0]):
         key = pack(cells[c, 0], cells[c, 1], cells[c, 2])
@@ -46,7 +46,7 @@ def _insert(slots, cells):
         slots[row, 0], slots[row, 1] = key, c
 
 
-@njit(cache=True)
+@kernel
 def _count(slots, corner, extent, edge, origins, directions, lengths, counts):
     for ray in range(origins.shape[0]):
         at, step, until, stride = start_march(origins[ray], directions[ray], corner, edge)

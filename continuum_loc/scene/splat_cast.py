@@ -6,10 +6,10 @@ Each map point is taken as a small disc on its tangent plane.
 
 from __future__ import annotations
 
+from continuum_loc.compiling import kernel
 from continuum_loc.mapping.grid import find_slot, pack, span_bounds
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import VoxelIndex
-from numba import njit
 import numpy as np
 
 COVER = 1.25  # spacings: 99.9 % of a sampled surface lies nearer than this to a sample
@@ -51,7 +51,7 @@ def first_crossings(
     return rows, depths
 
 
-@njit(cache=True)
+@kernel
 def _cast(arrays, normals, origins, directions, lengths, radius, min_cos, oriented, rows, depths):
     for ray in range(origins.shape[0]):
         rows[ray], depths[ray] = _first_crossing(
@@ -59,7 +59,7 @@ def _cast(arrays, normals, origins, directions, lengths, radius, min_cos, orient
         )
 
 
-@njit(cache=True)
+@kernel
 def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos, oriented):
     """
     March through the index's blocks until the next one lies beyond the best crossing.
@@ -95,7 +95,7 @@ def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos,
     return best, (depth if best >= 0 else np.inf)
 
 
-@njit(cache=True)
+@kernel
 def start_march(origin, direction, corner, edge):
     """
     Start a march through cells of `edge` [m] counted from `corner` (Amanatides and Woo, 1987).
@@ -116,7 +116,7 @@ def start_march(origin, direction, corner, edge):
     return at, step, until, stride
 
 
-@njit(cache=True)
+@kernel
 def next_cell(at, step, until, stride):
     """Move a march (`start_march`) to its next cell; return how far along the ray it begins."""
     axis = int(np.argmin(until))
@@ -126,7 +126,7 @@ def next_cell(at, step, until, stride):
     return entered
 
 
-@njit(cache=True)
+@kernel
 def _cross_block(arrays, span, normals, origin, direction, radius, min_cos, oriented, best, depth):
     """Improve (row, depth) by the discs of the block with this span."""
     points = arrays.points

@@ -11,7 +11,6 @@ from pathlib import Path
 from continuum_loc.errors import MapError, SceneError
 from continuum_loc.mapping.formats.shapes import Cloud
 from continuum_loc.mapping.map_files import read_shape
-from continuum_loc.simulator import convex, cutting
 from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scene_cache import cached_scene
@@ -37,8 +36,9 @@ def import_mesh(path: Path) -> Scene:
     """
     mesh = _load(path)
     check_mesh(mesh.vertices, mesh.faces, str(path))
-    made_from = [path, Path(__file__), Path(convex.__file__), Path(cutting.__file__)]
-    return cached_scene(path.stem, made_from, lambda: _scene(path, mesh.vertices, mesh.faces))
+    return cached_scene(
+        path.stem, __name__, lambda: _scene(path, mesh.vertices, mesh.faces), made_from=[path]
+    )
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:

@@ -1,8 +1,8 @@
 """
 Built scenes on disk, so that a scene which takes seconds to make is made once.
 
-An entry's name holds a digest of everything that it was made from (the generators' source among
-it): a changed generator never meets an old entry.
+An entry's name holds a digest of everything that it was made from, the generator's code and what
+that imports among it: a changed generator never meets an old entry.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import hashlib
 import os
 from pathlib import Path
 
+from continuum_loc.caches import cache_folder
+from continuum_loc.closure import digest_of_code
 from continuum_loc.npz_files import read_arrays
 from continuum_loc.simulator.scene import Anomaly, Scene
 import numpy as np
 
+KIND = 'scenes'
 
-def cached_scene(name: str, made_from: Iterable[Path], build: Callable[[], Scene]) -> Scene:
+
+def cached_scene(
+    name: str, generator: str, build: Callable[[], Scene], made_from: Iterable[Path] = ()
+) -> Scene:
     """
     Take the scene `name` from the cache, or build it and put it there.
 
-    `made_from`: files whose content decides the scene.
+    generator: name of the module that builds it. made_from: files whose content decides it too.
     """
-    digest = hashlib.sha256()
-    for path in sorted(made_from):
+    digest = hashlib.sha256(digest_of_code(generator, __name__, presets=False).encode())
+    for path in made_from:
         digest.update(path.read_bytes())
-    entry = cache_folder() / f'{name}-{digest.hexdigest()[:16]}.npz'
+    entry = cache_folder(KIND) / f'{name}-{digest.hexdigest()[:16]}.npz'
     try:
         return _read(entry)
     except (OSError, KeyError, ValueError):
         scene = build()  # absent, or cut short by a crash
     _write(scene, entry)
     return scene
-
-
-def cache_folder() -> Path:
-    """`$XDG_CACHE_HOME/continuum_loc`, by default `~/.cache/continuum_loc`."""
-    home = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
-    return Path(home) / 'continuum_loc' / 'scenes'
 
 
 def _write(scene: Scene, entry: Path) -> None:

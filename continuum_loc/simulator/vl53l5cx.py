@@ -19,12 +19,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from continuum_loc.compiling import kernel
 from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID
 from continuum_loc.robot import TofModel
 from continuum_loc.settings import Settings
 from continuum_loc.simulator.tof import Echoes, Readings
 from continuum_loc.simulator.vl53l5cx_unit import Units
-from numba import njit
 import numpy as np
 from pydantic import Field, model_validator
 
@@ -345,7 +345,7 @@ def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndar
     return best_signal, best_depth
 
 
-@njit(cache=True)
+@kernel
 def _targets(depth, signal, width, threshold, closest):
     """
     Depth, signal and spread (N,) of the reported pulse among K returns (N, K) of each zone.
@@ -373,7 +373,7 @@ def _targets(depth, signal, width, threshold, closest):
     return best_depth, best_signal, best_spread
 
 
-@njit(cache=True)
+@kernel
 def _gather(depth, signal, centre, width):
     """Total, mean and standard deviation of the returns within `width` of a depth, weighted."""
     total, first, second = 0.0, 0.0, 0.0

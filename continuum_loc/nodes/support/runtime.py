@@ -13,6 +13,7 @@ import sys
 import tempfile
 import threading
 from typing import Any
+from weakref import WeakSet
 
 from continuum_loc.errors import ContinuumLocError, SettingsError
 from continuum_loc.nodes.support.parameters import (
@@ -38,7 +39,10 @@ from rclpy.task import Future
 
 BAD_INPUT = 2
 HEARTBEAT = 0.2  # s
+GRACE = 0.2  # s; in which a node that is being made may end by itself when it is told to stop
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+_nodes: WeakSet[PackageNode] = WeakSet()  # of this process, also those that are still being made
 
 
 class PackageNode(Node):
@@ -46,6 +50,7 @@ class PackageNode(Node):
 
     def __init__(self, name: str, defaults: Settings, **options: Any) -> None:
         super().__init__(name, **options)
+        _nodes.add(self)
         self.finished = Future()
         self.failure: Exception | None = None
         self.settings = declare(self, defaults)
@@ -150,8 +155,9 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
     node, failure = None, None
+    making = _Making(make)
     try:
-        node = make()
+        node = making.result()
         _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -163,6 +169,7 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         if node is not None:
             failure = _closed(node, failure or node.failure)
         rclpy.try_shutdown()
+        making.abandon()
     return 0 if failure is None else _complain(failure)
 
 
@@ -174,6 +181,56 @@ def _closed(node: PackageNode, failure: Exception | None) -> Exception | None:
         failure = failure or error
     node.destroy_node()
     return failure
+
+
+class _Making:
+    """
+    The making of a node in a thread of its own, while this one hears signals.
+
+    The first one on a machine compiles for a minute or two, most of it inside LLVM, and rclpy's
+    handler of signals only says that ROS is shut down, which nobody would look at meanwhile.
+    """
+
+    def __init__(self, make: Callable[[], PackageNode]) -> None:
+        self._make = make
+        self._node: PackageNode | None = None
+        self._error: BaseException | None = None
+        # Not the thread itself: one whose `join` a signal interrupted counts as ended.
+        self._done = threading.Event()
+        threading.Thread(target=self._work, name='making', daemon=True).start()
+
+    def result(self) -> PackageNode:
+        """
+        Wait for the node.
+
+        Raises what its making raised, or ExternalShutdownException when told to stop before.
+        """
+        while not self._done.wait(HEARTBEAT):
+            if not rclpy.ok():
+                raise ExternalShutdownException
+        if self._error is not None:
+            raise self._error
+        return self._node
+
+    def abandon(self) -> None:
+        """End the process where the node is still being made: nothing else ends a compilation."""
+        sys.setswitchinterval(1e-4)  # the other thread computes, and this one is in a hurry
+        if self._done.wait(GRACE):
+            return
+        for node in _nodes:  # so that nothing of theirs is left on the graph
+            node.destroy_node()
+        rclpy.get_default_context().destroy()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+
+    def _work(self) -> None:
+        try:
+            self._node = self._make()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._done.set()
 
 
 def _spin(node: PackageNode) -> None:
