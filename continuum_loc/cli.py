@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import shutil
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
@@ -128,6 +129,14 @@ def simulate(
         str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")
     ] = 'full',
     fidelity: Annotated[str, typer.Option(help='ToF model: `paper` or `vl53l5cx`')] = 'paper',
+    world_name: Annotated[
+        str,
+        typer.Option(
+            '--world',
+            help='`ideal`, `disturbed`, or true departures of your own (YAML); '
+            '`disturbed:mounts+base` takes parts alone',
+        ),
+    ] = 'ideal',
     duration: Annotated[
         float | None, typer.Option(help='seconds; default: the whole trajectory')
     ] = None,
@@ -138,7 +147,7 @@ def simulate(
 
     Example: `continuum-loc simulate /tmp/trial --scene S3 --trajectory t2 --seed 4`
     """
-    from continuum_loc.offline.trials import Trial, world, write_bag
+    from continuum_loc.offline.trials import Trial, trial_map_file, world, write_bag
 
     trial = Trial(
         robot,
@@ -149,6 +158,7 @@ def simulate(
         fidelity=fidelity,
         seed=seed,
         duration=duration,
+        world=world_name,
     )
     with _busy() as status:
         status.update('building the scene and letting the robot come to rest')
@@ -156,6 +166,10 @@ def simulate(
     seconds = made.trajectory.duration if duration is None else duration
     counts = write_bag(bag, _progress(made.run(duration), 'simulating', seconds))
     _count_table(counts, f'{bag}: {seconds:g} s')
+    if made.scene is not None and trial.departures.map_departs:
+        prior_map = bag.with_name(f'{bag.name}_map.npz')
+        shutil.copyfile(trial_map_file(trial), prior_map)
+        console.print(f'prior map as it was scanned: {prior_map}', highlight=False)
 
 
 @app.command('import-trial')

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
     from continuum_loc.mapping.prior_map import PriorMap
+    from continuum_loc.simulator.departures import Departures
     from continuum_loc.simulator.world import World
 
 MAP_POINTS = 300_000
@@ -43,6 +44,8 @@ class Trial:
     map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
     `paper` or `vl53l5cx`. plant: a bundled name or a YAML file; None for the robot's own.
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
+    world: `ideal`, or a file of true departures (`simulator.departures`), which also says what ToF
+    sensors it has; the prior map departs with it.
     drawn_base: the base sits where a draw from the description's own spread puts it, not where
     the description says: what a covariance that counts with this spread has to be judged by.
     duration: seconds; None for the trajectory's own.
@@ -59,6 +62,17 @@ class Trial:
     seed: int = 0
     duration: float | None = None
     plant: str | None = None
+    world: str = 'ideal'
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'fidelity', self.departures.fidelity(self.fidelity))
+
+    @property
+    def departures(self) -> Departures:
+        """In what the trial's world departs from the files that the estimator reads."""
+        from continuum_loc.simulator.departures import load_departures
+
+        return load_departures(self.world)
 
     @property
     def recording(self) -> str:
@@ -75,6 +89,7 @@ class Trial:
                 ]
                 + ['disturbed'] * self.disturbed
                 + ['drawn'] * self.drawn_base
+                + [_world_name(self.world)] * (self.world != 'ideal')
                 + [Path(self.plant or '').stem] * bool(self.plant)
             )
             + f'-{self.seed}{length}'
@@ -84,6 +99,14 @@ class Trial:
     def name(self) -> str:
         """Name the trial, uniquely among trials."""
         return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
+
+
+def _world_name(world: str) -> str:
+    """Name a world in a folder's name; a file of one's own by what it says."""
+    name, _, parts = world.partition(':')
+    own = Path(name).suffix in ('.yaml', '.yml')
+    said = f'_{hashlib.sha256(Path(name).read_bytes()).hexdigest()[:8]}' if own else ''
+    return f'{Path(name).stem}{said}{"_" * bool(parts)}{parts.replace("+", "_")}'
 
 
 def world(trial: Trial, faults: tuple = ()) -> World:
@@ -96,9 +119,24 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         robot = _base_drawn(robot, trial.seed)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
+    scene = load_scene(trial.scene) if robot.tof else None
+    if trial.world != 'ideal':
+        from continuum_loc.offline.disturbed import true_world
+
+        return true_world(
+            robot,
+            scene,
+            trial.trajectory,
+            trial.departures,
+            seed=trial.seed,
+            fidelity=trial.fidelity,
+            plant=trial.plant,
+            profile=trial.profile,
+            faults=faults,
+        )
     return World(
         robot,
-        load_scene(trial.scene) if robot.tof else None,
+        scene,
         trial.trajectory,
         plant=trial.plant,
         profile=trial.profile,
@@ -145,13 +183,22 @@ def measured(trial: Trial) -> list[Measurement]:
 
 def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
     """Simulate and estimate, both in this thread; only the estimator is timed."""
+    from continuum_loc.mapping.map_files import load_map
+
     robot = load_robot(trial.robot)
     return replay(
         simulate(trial),
-        make_filter(
-            robot, scene_map(trial.map_scene or trial.scene), settings or trial_settings(trial)
-        ),
+        make_filter(robot, load_map(trial_map_file(trial)), settings or trial_settings(trial)),
     )
+
+
+def trial_map_file(trial: Trial) -> Path:
+    """Name the file of the prior map that the estimator is given in a trial."""
+    from continuum_loc.offline.disturbed import scanned_map_file
+
+    nominal = scene_map_file(trial.map_scene or trial.scene)
+    departures = trial.departures
+    return scanned_map_file(nominal, departures, trial.seed) if departures.map_departs else nominal
 
 
 def trial_settings(trial: Trial) -> EstimatorSettings:
@@ -241,6 +288,7 @@ def configuration(trial: Trial, **more: Any) -> dict[str, Any]:
         'profile': trial.profile,
         'tof_fidelity': trial.fidelity,
         'disturbed': trial.disturbed,
+        'world': trial.world,
         'seed': trial.seed,
         'duration': trial.duration,
         **more,

@@ -140,13 +140,13 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
     from continuum_loc.offline.trials import (
         configuration,
         make_filter,
-        scene_map_file,
+        trial_map_file,
         trial_settings,
     )
     from continuum_loc.robot import load_robot
 
     settings = settings or trial_settings(trial)
-    map_file = scene_map_file(trial.map_scene or trial.scene)
+    map_file = trial_map_file(trial)
     resolved = configuration(trial, estimator=settings)
     key = configuration_digest(
         resolved, asdict(trial), replay_digest(), made_by(bag), map_file.name
