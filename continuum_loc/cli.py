@@ -395,6 +395,10 @@ def evaluate(
     minutes: Annotated[
         float | None, typer.Option(help='with `soak`: how long, instead of half an hour', min=0.5)
     ] = None,
+    worlds: Annotated[
+        list[str] | None,
+        typer.Option('--world', help='`ideal` or `disturbed` alone; studies print both'),
+    ] = None,
     scheduler: Annotated[
         str, typer.Option(help='address of a Dask scheduler to run the trials on')
     ] = '',
@@ -431,6 +435,7 @@ def evaluate(
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
     SCHEDULER.set(scheduler)
+    _choose_worlds(worlds or [])
     if run is None:
         claims = _evaluate_bags(folder, robot, map_file, settings, out, jobs)
     elif minutes is not None:
@@ -444,6 +449,19 @@ def evaluate(
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _choose_worlds(names: list[str]) -> None:
+    """Let studies run in these worlds alone, if there are any."""
+    if not names:
+        return
+    require_research()
+    from studies.support.worlds import WORLDS
+
+    for name in names:
+        if name not in WORLDS.get():
+            raise typer.BadParameter(f"--world '{name}': give {' or '.join(WORLDS.get())}")
+    WORLDS.set(tuple(dict.fromkeys(names)))
 
 
 def _study(name: str) -> Any:

@@ -89,7 +89,7 @@ class Trial:
                 ]
                 + ['disturbed'] * self.disturbed
                 + ['drawn'] * self.drawn_base
-                + [_world_name(self.world)] * (self.world != 'ideal')
+                + [f'world_{_world_name(self.world)}'] * (self.world != 'ideal')
                 + [Path(self.plant or '').stem] * bool(self.plant)
             )
             + f'-{self.seed}{length}'
