@@ -443,12 +443,28 @@ def evaluate(
 
         claims = soak(out, 60.0 * minutes, seed)
     else:
-        claims = run(out, quick, seed, jobs)
+        claims = _run_study(name, run, out, quick, seed, jobs)
     console.print(_claims_table(claims))
     for trial, error in _failed(out, name).items():
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _run_study(name: str, run: Any, out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
+    """Run a study; one that is reported is entered into the books, unless it is a quick run."""
+    from studies.support import books
+
+    if quick:
+        return run(out, quick, seed, jobs)
+    books.require_book(name)
+    claims = run(out, quick, seed, jobs)
+    if books.enter(name, seed, claims):
+        errors.print(
+            f'[yellow]reported before with other numbers of the filter:[/] see {books.LOG}',
+            highlight=False,
+        )
+    return claims
 
 
 def _choose_worlds(names: list[str]) -> None:
