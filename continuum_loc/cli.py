@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 import json
 from pathlib import Path
+import shutil
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
@@ -132,6 +133,14 @@ def simulate(
         str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")
     ] = 'full',
     fidelity: Annotated[str, typer.Option(help='ToF model: `paper` or `vl53l5cx`')] = 'paper',
+    world_name: Annotated[
+        str,
+        typer.Option(
+            '--world',
+            help='`ideal`, `disturbed`, or true departures of your own (YAML); '
+            '`disturbed:mounts+base` takes parts alone',
+        ),
+    ] = 'ideal',
     duration: Annotated[
         float | None, typer.Option(help='seconds; default: the whole trajectory')
     ] = None,
@@ -142,6 +151,7 @@ def simulate(
 
     Example: `continuum-loc simulate /tmp/trial --scene S3 --trajectory t2 --seed 4`
     """
+    from continuum_loc.offline.trial_runs import trial_map_file
     from continuum_loc.offline.trials import Trial, world, write_bag
 
     trial = Trial(
@@ -153,6 +163,7 @@ def simulate(
         fidelity=fidelity,
         seed=seed,
         duration=duration,
+        world=world_name,
     )
     with _busy() as status:
         status.update('building the scene and letting the robot come to rest')
@@ -160,6 +171,10 @@ def simulate(
     seconds = made.trajectory.duration if duration is None else duration
     counts = write_bag(bag, _progress(made.run(duration), 'simulating', seconds))
     _count_table(counts, f'{bag}: {seconds:g} s')
+    if made.scene is not None and trial.departures.map_departs:
+        prior_map = bag.with_name(f'{bag.name}_map.npz')
+        shutil.copyfile(trial_map_file(trial), prior_map)
+        console.print(f'prior map as it was scanned: {prior_map}', highlight=False)
 
 
 @app.command('import-trial')
@@ -433,6 +448,10 @@ def evaluate(
     minutes: Annotated[
         float | None, typer.Option(help='with `soak`: how long, instead of half an hour', min=0.5)
     ] = None,
+    worlds: Annotated[
+        list[str] | None,
+        typer.Option('--world', help='`ideal` or `disturbed` alone; studies print both'),
+    ] = None,
     scheduler: Annotated[
         str, typer.Option(help='address of a Dask scheduler to run the trials on')
     ] = '',
@@ -469,6 +488,7 @@ def evaluate(
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
     SCHEDULER.set(scheduler)
+    _choose_worlds(worlds or [])
     if run is None:
         claims = _evaluate_bags(folder, robot, map_file, settings, out, jobs)
     elif minutes is not None:
@@ -476,12 +496,41 @@ def evaluate(
 
         claims = soak(out, 60.0 * minutes, seed)
     else:
-        claims = run(out, quick, seed, jobs)
+        claims = _run_study(name, run, out, quick, seed, jobs)
     console.print(_claims_table(claims))
     for trial, error in _failed(out, name).items():
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _run_study(name: str, run: Any, out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
+    """Run a study; one that is reported is entered into the books, unless it is a quick run."""
+    from studies.support import books
+
+    if quick:
+        return run(out, quick, seed, jobs)
+    books.require_book(name)
+    claims = run(out, quick, seed, jobs)
+    if books.enter(name, seed, claims):
+        errors.print(
+            f'[yellow]reported before with other numbers of the filter:[/] see {books.LOG}',
+            highlight=False,
+        )
+    return claims
+
+
+def _choose_worlds(names: list[str]) -> None:
+    """Let studies run in these worlds alone, if there are any."""
+    if not names:
+        return
+    require_research()
+    from studies.support.worlds import WORLDS
+
+    for name in names:
+        if name not in WORLDS.get():
+            raise typer.BadParameter(f"--world '{name}': give {' or '.join(WORLDS.get())}")
+    WORLDS.set(tuple(dict.fromkeys(names)))
 
 
 def _study(name: str) -> Any:

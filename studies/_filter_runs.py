@@ -16,17 +16,16 @@ from typing import Any
 
 from continuum_loc.closure import is_ours
 from continuum_loc.estimate import Estimate
-from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
+from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import Measurement, NANOSECONDS, nanoseconds, TruthSample
 from continuum_loc.offline.as_json import write_json
-from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.localise import make_filter, trial_settings
 from continuum_loc.offline.metrics import Errors, errors
 from continuum_loc.offline.replay import Filter, replay, samples_of
 from continuum_loc.offline.runs import load_run, Run, save_run
-from continuum_loc.offline.scene_maps import scene_map_file
 from continuum_loc.offline.source import replay_digest
-from continuum_loc.offline.trial_runs import configuration
+from continuum_loc.offline.trial_runs import configuration, trial_map_file
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
@@ -167,7 +166,7 @@ def replay_case(out: Path, case: Case) -> tuple[str, str]:
 def _replay(out: Path, case: Case, folder: Path) -> None:
     trial, settings = case.trial, case_settings(case)
     resolved = configuration(trial, estimator=settings, case=case, faults=repr(case.faults))
-    bag, map_file = bag_of(out, trial), scene_map_file(trial.map_scene or trial.scene)
+    bag, map_file = bag_of(out, trial), trial_map_file(trial)
     key = configuration_digest(resolved, code_of(case), made_by(bag), map_file.name)
     if _digest(folder) == key:
         return
@@ -202,7 +201,7 @@ def _digest(folder: Path) -> str | None:
 
 def case_settings(case: Case) -> EstimatorSettings:
     """Change the settings that come with the robot as the case says. Raises SettingsError."""
-    data = load_estimator_settings(load_robot(case.trial.robot).name).model_dump()
+    data = trial_settings(case.trial).model_dump()
     for section, value in case.changes.items():
         data[section] = {**data[section], **value} if isinstance(value, dict) else value
     return parse_settings(EstimatorSettings, data, where=case.name)

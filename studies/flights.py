@@ -17,7 +17,6 @@ from continuum_loc.errors import InputError
 from continuum_loc.offline.claims import at_most, between, Claim, write_study
 from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
 import numpy as np
-from studies._filter_runs import write_page
 from studies._flight_room import simulated_flight
 from studies._flight_statistics import (
     BANDS,
@@ -30,6 +29,7 @@ from studies._flight_statistics import (
     spread,
     STATUSES,
 )
+from studies._pages import write_page
 
 VARIABLE = 'CONTINUUM_LOC_FLIGHTS'
 # The first 21 of the 43 flights of the list, in its order.
@@ -200,7 +200,9 @@ def figures(
                 label=kind,
             )
     axes[0].set_xticks(range(len(SHARES)), SHARES, rotation=60)
-    axes[0].set(ylabel='share [%], 10th to 90th percentile over flights', yscale='symlog')
+    axes[0].set(
+        ylabel='share [%], 10th to 90th percentile over flights', yscale='symlog', ylim=(0.0, None)
+    )
     for kind, found in by_distance.items():
         if found:
             middle = [np.mean(band) for band in BANDS]

@@ -13,7 +13,8 @@ from continuum_loc import cli
 from continuum_loc.measurements import ImuSample, StrainSample, TofFrame
 from continuum_loc.offline.report import context_of
 from continuum_loc.offline.runs import load_run
-from continuum_loc.offline.trials import scene_map_file, simulate, Trial
+from continuum_loc.offline.scene_maps import scene_map_file
+from continuum_loc.offline.trials import simulate, Trial
 from msg_tools.bag import BagWriter
 from msg_tools.topics import topic_of
 import numpy as np

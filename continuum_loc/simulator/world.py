@@ -78,6 +78,7 @@ class World:
     scene: None is empty space, without ToF frames.
     tof_settings, readout: how ToF sensors of the fidelity `vl53l5cx` depart from ideal, and how
     their frames come; None takes what public flights show.
+    T_magnet_true: (4, 4), where the magnet sits in the frame where it should; None: there.
     faults: wrappers of `faults`, applied to the stream in order.
     """
 
@@ -92,6 +93,7 @@ class World:
         tof_fidelity: str = 'paper',
         tof_settings: Vl53l5cxSettings | None = None,
         readout: ReadoutSettings | None = None,
+        T_magnet_true: np.ndarray | None = None,
         seed: int = 0,
         faults: tuple = (),
         start_stamp: int = DEFAULT_START,
@@ -108,7 +110,7 @@ class World:
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
         _check_fidelity(tof_fidelity)
         self.tof_fidelity, self.tof_settings = tof_fidelity, tof_settings
-        self.readout = readout or ReadoutSettings()
+        self.readout, self.T_magnet_true = readout or ReadoutSettings(), T_magnet_true
         model = build_model(robot, self.plant, scene, profile, self.trajectory.supported)
         self.body = _Body(robot, self.plant, model, self.trajectory)
         self.motion = Motion()
@@ -219,6 +221,8 @@ class World:
         def sample(stamp: int, time: float) -> list:
             nodes = self.motion.pose(time)
             T_map_magnet = backbone(nodes, self.nodes_s, magnet.s) if magnet else nodes[0]
+            if self.T_magnet_true is not None:
+                T_map_magnet = T_map_magnet @ self.T_magnet_true
             return model.measure(stamp, pose(time), T_map_magnet)
 
         return _Stream(self.robot.hall_model.rate, sample)
