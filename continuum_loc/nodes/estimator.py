@@ -230,8 +230,7 @@ class EstimatorNode(WorkerNode):
         """Make a filter without a past, which no graph asks for, and with all its memory."""
         settings = self.filter_settings.model_copy(update={'history': 0.0})
         made = SlidingWindowFilter(robot, self.prior_map, settings)
-        if made.tof is not None:
-            made.tof.index.reserve()
+        made.reserve()
         return made
 
     def _preset(self) -> EstimatorSettings:
