@@ -107,10 +107,7 @@ class SlidingWindowFilter:
     def _make_tof(self, prior_map) -> TofFactor | None:
         if prior_map is None or not self.settings.tof.enabled or not self.robot.tof:
             return None
-        from continuum_loc.mapping.voxel_index import VoxelIndex
-
-        index = VoxelIndex(prior_map.points, prior_map.normals, reach=self.settings.tof.gate)
-        return TofFactor(self.robot, self.grid, self.settings, prior_map, index)
+        return TofFactor(self.robot, self.grid, self.settings, prior_map, prior_map.index)
 
     # -------------------------------------------------------------- measurements in, estimates out
 

@@ -300,7 +300,7 @@ class ShapeSearch:
     def _map(self) -> tuple:
         """Return the thinned map, made at the first search."""
         if self._thinned is None:
-            self._thinned = thinned(self._tof, COARSE_SPACING, self.settings.score_gate)
+            self._thinned = thinned(self._tof, COARSE_SPACING)
         return self._thinned
 
     def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
@@ -364,7 +364,7 @@ class ShapeSearch:
         return strain
 
 
-def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
+def thinned(tof: TofFactor, spacing: float) -> tuple:
     """
     Thin the map's arrays for the kernels.
 
@@ -380,7 +380,7 @@ def thinned(tof: TofFactor, spacing: float, reach: float) -> tuple:
     keys = np.ravel_multi_index((*cells.T, octants), (*(cells.max(axis=0) + 1), 8))
     order = np.argsort(keys, kind='stable')
     kept = order[np.flatnonzero(np.diff(keys[order], prepend=-1))]
-    index = VoxelIndex(points[kept], normals[kept], reach=reach)
+    index = VoxelIndex(points[kept], normals[kept])
     return index.arrays, surface[kept], variance
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from continuum_loc.errors import MapError
+from continuum_loc.mapping.grid import spatial_order
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import spatial_order
 from numba import njit
 import numpy as np
 
