@@ -301,7 +301,7 @@ def polynomial(c, A, out, work):
         out[i, i] += c[0]
 
 
-@njit(cache=True)
+@kernel
 def polynomial_times(twist, w, value, derivative, scratch):
     """
     Write f(ad(x)) w into value (6,), and its derivative by x into derivative (6, 6).
@@ -357,7 +357,7 @@ def _subtract_ad(D, x):
     D[2, 4] -= x[0]
 
 
-@njit(cache=True)
+@kernel
 def pose_error(T_wanted, T, error, J, scratch):
     """Write Log(T_wanted^-1 T) into `error`, a TWIST, and its Jacobian by T into J (6, 6)."""
     relative(T_wanted, T, scratch.pose)

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import SingularError
 from continuum_loc.estimator.normal import Normal
-from numba import njit
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import blas, lapack
@@ -220,7 +220,7 @@ def steps_of(B: np.ndarray) -> list[Step]:
     ]
 
 
-@njit(cache=True)
+@kernel
 def _reaches(B, rows):
     """Columns of B (D, m) up to the last that is not zero in each block of `rows` or above."""
     blocks = (B.shape[0] + rows - 1) // rows

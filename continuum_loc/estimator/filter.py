@@ -132,11 +132,6 @@ class SlidingWindowFilter:
                 out.append(self._compose(time, fit, outcome, started))
         return out
 
-    def reserve(self) -> None:
-        """Take at once the memory that may be needed in the course of a run."""
-        for factor in self.factors:
-            factor.reserve()
-
     def _admit(self, measurement: Measurement) -> bool:
         """Put the measurement into its interval; False where it was dropped and counted."""
         if self.epoch is None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from continuum_loc import lie_kernels as lk
-from numba import njit
+from continuum_loc.compiling import kernel
 import numpy as np
 
 
@@ -81,7 +81,7 @@ def new_workspace() -> np.ndarray:
     return np.zeros(1, WORKSPACE)
 
 
-@njit(cache=True)
+@kernel
 def relate(ends, work):
     """Leave two states, and how b lies from a, in the workspace."""
     at = work[0]
@@ -105,7 +105,7 @@ def relate(ends, work):
     lk.product(at.w_by_xi, left, at.w_by_a)
 
 
-@njit(cache=True)
+@kernel
 def _by_ends(by_xi, by_a, by_w, work, J):
     """J (6, 24) of by_xi xi + by_a v_a + by_w w."""
     at = work[0]
@@ -119,7 +119,7 @@ def _by_ends(by_xi, by_a, by_w, work, J):
         J[i, 6 + i] = by_a
 
 
-@njit(cache=True)
+@kernel
 def evaluate(work, tau, pose, first):
     """
     Find the state at tau in [0, span] between two that `relate` left in the workspace.
@@ -147,7 +147,7 @@ def evaluate(work, tau, pose, first):
         _add_product(at.right_gamma, at.slope_by_ends, first, at.J_rate)
 
 
-@njit(cache=True)
+@kernel
 def _add_product(A, B, first, out):
     """Add A (6, 6) B (6, 24) to out, from row `first` on."""
     for i in range(first, 6):
@@ -157,7 +157,7 @@ def _add_product(A, B, first, out):
                 out[i, j] += scale * B[k, j]
 
 
-@njit(cache=True)
+@kernel
 def _place(work, tau):
     """Find gamma and its derivative at tau."""
     at = work[0]
@@ -174,7 +174,7 @@ def _place(work, tau):
         slope[i] = h[3] * xi[i] + h[4] * v_a[i] + h[5] * w[i]
 
 
-@njit(cache=True)
+@kernel
 def pose_at(work, tau):
     """Find T alone, between two states that `relate` left in the workspace."""
     _place(work, tau)
@@ -183,7 +183,7 @@ def pose_at(work, tau):
     lk.compose(at.T_a, at.step, at.T)
 
 
-@njit(cache=True)
+@kernel
 def rate_at(work, tau):
     """Find v alone, between two states that `relate` left in the workspace."""
     _place(work, tau)
@@ -194,7 +194,7 @@ def rate_at(work, tau):
     lk.polynomial_times(gamma, at.slope, at.v, at.v_by_gamma, at.scratch)
 
 
-@njit(cache=True)
+@kernel
 def motion_error(ends, e, J, work):
     """Prior error e (12,) = [xi - d v_a; w - v_a] and its Jacobian J (12, 24)."""
     relate(ends, work)
@@ -206,7 +206,7 @@ def motion_error(ends, e, J, work):
     _by_ends(0.0, -1.0, 1.0, work, J[6:])
 
 
-@njit(cache=True)
+@kernel
 def transport_error(ends, e, J, work):
     """
     How a rate varies from a to b: e (6,) = v_b - Ad(T_b^-1 T_a) v_a and its Jacobian J (6, 24).
@@ -231,7 +231,7 @@ def transport_error(ends, e, J, work):
             J[i, 18 + j] = 1.0 if i == j else 0.0
 
 
-@njit(cache=True)
+@kernel
 def bridge(tau, d):
     """
     Covariance (2, 2) of (pose, rate) at tau given both ends, per unit of q.
@@ -252,7 +252,7 @@ def bridge(tau, d):
     return out
 
 
-@njit(cache=True)
+@kernel
 def motion_squared(e, d, q_inverse):
     """Squared error e^T Q(d)^-1 (x) diag(q)^-1 e of `motion_error`'s e (12,)."""
     a, b, c = 12.0 / d**3, -6.0 / d**2, 4.0 / d
@@ -264,7 +264,7 @@ def motion_squared(e, d, q_inverse):
     return squared
 
 
-@njit(cache=True)
+@kernel
 def add_motion(normal, index, e, J, d, q_inverse):
     """
     Add the prior's normal equations at the 24 rows `index`; returns the squared error.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.state import (
     Column,
@@ -14,7 +15,6 @@ from continuum_loc.estimator.state import (
     POSE_PART,
     VELOCITY_PART,
 )
-from numba import njit
 import numpy as np
 
 _WORK = gp.new_workspace()  # of kernels that run one at a time, and leave nothing in it
@@ -137,7 +137,7 @@ def rattle_covariance(s_imu: np.ndarray, turns: np.ndarray, s: np.ndarray) -> np
     return covariance
 
 
-@njit(cache=True)
+@kernel
 def _rattle(s_imu, turns, s, covariance):
     at, turn, shift = (
         np.zeros(len(s_imu) + 1),
@@ -153,7 +153,7 @@ def _rattle(s_imu, turns, s, covariance):
     covariance[:, 2, 2] = np.square(np.interp(s, at, shift[1]))
 
 
-@njit(cache=True)
+@kernel
 def _interpolate(a, b, tau, nodes, out, work):
     pose, rate = out.J_pose.shape[0] > 0, out.J_rate.shape[0] > 0
     for m in range(tau.shape[0]):
@@ -174,7 +174,7 @@ def backbone(grid: Grid, T: np.ndarray, strain: np.ndarray, s: np.ndarray) -> np
     return out
 
 
-@njit(cache=True)
+@kernel
 def _backbone(T, strain, s, segments, offsets, out, work):
     related = -1
     for m in range(segments.shape[0]):

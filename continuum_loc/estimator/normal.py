@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numba import njit
+from continuum_loc.compiling import kernel
 import numpy as np
 
 
@@ -40,12 +40,12 @@ def symmetric(H: np.ndarray) -> np.ndarray:
     return H + np.triu(H, 1).T
 
 
-@njit(cache=True)
+@kernel
 def new_normal(size):
     return Normal(np.zeros((size, size)), np.zeros(size))
 
 
-@njit(cache=True)
+@kernel
 def add_rows(normal, index, e, J, weights):
     """Add sum_i weights_i (e_i + J_i x)^2 / 2 at the rows `index`; the squared error."""
     H, g = normal.H, normal.g
@@ -63,7 +63,7 @@ def add_rows(normal, index, e, J, weights):
     return squared
 
 
-@njit(cache=True)
+@kernel
 def gather(total, local, J, work):
     """
     Add a local quadratic (m), chained through J (m, n), to `total` (n); work (m, n).
@@ -88,7 +88,7 @@ def gather(total, local, J, work):
                 total.H[j, k] += slope * work[i, k]
 
 
-@njit(cache=True)
+@kernel
 def gather_rows(total, e, J):
     """Add |e + J x|^2 / 2 to `total`, before one `scatter`."""
     for i in range(e.shape[0]):
@@ -101,7 +101,7 @@ def gather_rows(total, e, J):
                 total.H[j, k] += slope * J[i, k]
 
 
-@njit(cache=True)
+@kernel
 def scatter(normal, index, total, weight):
     """Add `total` times a weight at the rows `index` (n,), and clear it."""
     n = index.shape[0]

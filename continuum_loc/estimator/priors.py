@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from continuum_loc import lie, lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.normal import add_rows, Normal
 from continuum_loc.estimator.settings import EstimatorSettings
@@ -26,7 +27,6 @@ from continuum_loc.estimator.state import (
     VELOCITY,
 )
 from continuum_loc.robot import RobotDescription
-from numba import njit
 import numpy as np
 
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
@@ -138,7 +138,7 @@ def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
     return base.T_map_base @ along, np.stack([sigma**-2.0, rate**-2.0])
 
 
-@njit(cache=True)
+@kernel
 def _add(normal, a, b, in_time, of_column, share, jerked, work):
     """Add all factors of an interval; returns their cost."""
     dim = normal.g.shape[0] // 2
@@ -148,7 +148,7 @@ def _add(normal, a, b, in_time, of_column, share, jerked, work):
     return cost + 0.5 * _add_column(newer, b, of_column, share, work)
 
 
-@njit(cache=True)
+@kernel
 def _add_time(normal, a, b, prior, jerked, work):
     """
     Add each node's step from knot to knot, under a Cauchy loss; returns the robust cost.
@@ -181,7 +181,7 @@ def _add_time(normal, a, b, prior, jerked, work):
     return cost
 
 
-@njit(cache=True)
+@kernel
 def _add_step(normal, older, weight, step):
     """Add the random walk of one entry of a column, which went by `step` to the newer one."""
     newer = older + normal.g.shape[0] // 2
@@ -192,7 +192,7 @@ def _add_step(normal, older, weight, step):
     normal.g[newer] += weight * step
 
 
-@njit(cache=True)
+@kernel
 def _add_bias(normal, a, b, weight):
     for m in range(a.bias.shape[0]):
         for i in range(3):
@@ -200,14 +200,14 @@ def _add_bias(normal, a, b, weight):
             _add_step(normal, row, weight, b.bias[m, i] - a.bias[m, i])
 
 
-@njit(cache=True)
+@kernel
 def _add_column(normal, column, prior, share, work):
     """Add the factors of one column to its own equations; returns the squared error."""
     squared = _add_space(normal, column, prior, share, work)
     return squared + _add_base(normal, column, prior, share, work)
 
 
-@njit(cache=True)
+@kernel
 def _add_space(normal, column, prior, share, work):
     """Add rest strain, and strain and velocity along the segments; the squared error."""
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
@@ -236,7 +236,7 @@ def _add_space(normal, column, prior, share, work):
     return squared
 
 
-@njit(cache=True)
+@kernel
 def _add_base(normal, column, prior, share, work):
     """Add the base's pose and velocity; the squared error."""
     at, velocity = work[0], column.velocity[0]

@@ -11,13 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from continuum_loc import lie
+from continuum_loc.compiling import kernel
 from continuum_loc.estimator.factors.tof import Frame, match, Row, Rules, TofFactor, weigh
 from continuum_loc.estimator.normal import new_normal
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Grid
 from continuum_loc.estimator.surface import Surface, thinned
-from numba import njit
 import numpy as np
 
 # [m] of the thinned map that the search scores against; it has to tell decimetres apart.
@@ -74,7 +74,7 @@ class ShapeSearch:
     def _surface(self) -> Surface:
         """Return the thinned map, made at the first search."""
         if self._thinned is None:
-            self._thinned = thinned(self._tof.surface, COARSE_SPACING, self.settings.score_gate)
+            self._thinned = thinned(self._tof.surface, COARSE_SPACING)
         return self._thinned
 
     def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
@@ -125,7 +125,7 @@ class ShapeSearch:
         return strain
 
 
-@njit(cache=True)
+@kernel
 def _score(T, snapshot, surface, rules):
     """Robust cost (M,) of the frames at each pose T (M, 4, 4)."""
     zones = snapshot.q.shape[1]

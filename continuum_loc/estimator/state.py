@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from continuum_loc import lie, lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
 from continuum_loc.robot import RobotDescription
-from numba import njit
 import numpy as np
 
 TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
@@ -109,7 +109,7 @@ class Column(NamedTuple):
         )
 
 
-@njit(cache=True)
+@kernel
 def _retract(T, strain, velocity, bias, delta):
     step, moved = np.empty((4, 4)), np.empty((4, 4))
     nodes = T.shape[0]
@@ -126,19 +126,19 @@ def _retract(T, strain, velocity, bias, delta):
             bias[m, i] += delta[NODE_DIM * nodes + 3 * m + i]
 
 
-@njit(cache=True)
+@kernel
 def ends_in_time(a, b, n):
     """Two states of node n, at the columns a and b, as the process in time connects them."""
     return gp.Ends(a.T[n], a.velocity[n], b.T[n], b.velocity[n], b.time - a.time)
 
 
-@njit(cache=True)
+@kernel
 def ends_along(T, rate, s, n):
     """Nodes n and n + 1 at arclengths s (N,) with strain or velocity `rate` (N, 6)."""
     return gp.Ends(T[n], rate[n], T[n + 1], rate[n + 1], s[n + 1] - s[n])
 
 
-@njit(cache=True)
+@kernel
 def rows_in_time(n, dim, index):
     """Rows (24,) of the `Ends` of `ends_in_time` in an interval's two columns of `dim`."""
     for i in range(6):
@@ -148,7 +148,7 @@ def rows_in_time(n, dim, index):
         index[18 + i] = dim + index[6 + i]
 
 
-@njit(cache=True)
+@kernel
 def rows_along(n, part, index):
     """Rows (24,) of the `Ends` of `ends_along` in a column; part: STRAIN or VELOCITY."""
     for i in range(6):

@@ -28,7 +28,7 @@ class Surface(NamedTuple):
     planes: Planes
 
 
-def surface_of(prior_map: PriorMap, index: VoxelIndex, planarity_power: float) -> Surface:
+def surface_of(prior_map: PriorMap, planarity_power: float) -> Surface:
     """
     Weigh each point by its planarity, over the map's median and at most 1, to a power.
 
@@ -38,14 +38,14 @@ def surface_of(prior_map: PriorMap, index: VoxelIndex, planarity_power: float) -
     flat = max(float(np.median(prior_map.planarity)), 1e-9)
     weight = np.minimum(prior_map.planarity / flat, 1.0) ** planarity_power
     rows = np.column_stack([prior_map.points, prior_map.normals, weight])
-    return Surface(index.arrays, Planes(rows, prior_map.sigma**2))
+    return Surface(prior_map.index.arrays, Planes(rows, prior_map.sigma**2))
 
 
-def thinned(surface: Surface, spacing: float, reach: float) -> Surface:
+def thinned(surface: Surface, spacing: float) -> Surface:
     """
     Keep one point for each cell of `spacing` [m] and each octant of the normal.
 
-    So both sides of a thin blade stay. reach: as of `VoxelIndex`.
+    So both sides of a thin blade stay.
     """
     rows, variance = surface.planes
     points, normals = rows[:, :3], rows[:, 3:6]
@@ -54,5 +54,5 @@ def thinned(surface: Surface, spacing: float, reach: float) -> Surface:
     keys = np.ravel_multi_index((*cells.T, octants), (*(cells.max(axis=0) + 1), 8))
     order = np.argsort(keys, kind='stable')
     kept = order[np.flatnonzero(np.diff(keys[order], prepend=-1))]
-    index = VoxelIndex(points[kept], normals[kept], reach=reach)
+    index = VoxelIndex(points[kept], normals[kept])
     return Surface(index.arrays, Planes(rows[kept], variance))

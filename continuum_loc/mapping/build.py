@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
+from continuum_loc.mapping.grid import spatial_order
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import spatial_order
-from numba import njit
 import numpy as np
 
 NEIGHBOURS = 20  # of a PCA neighbourhood
@@ -263,7 +263,7 @@ def _poisson_subset(points, normals, spacing):
     return np.flatnonzero(_throw_darts(points, normals, cells, spacing, slots, following))
 
 
-@njit(cache=True)
+@kernel
 def _throw_darts(points, normals, cells, spacing, slots, following):
     """
     Accept each point unless an accepted one of its side lies within `spacing`.
@@ -295,7 +295,7 @@ def _throw_darts(points, normals, cells, spacing, slots, following):
     return accepted
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _cell_row(i, j, k, mask):
     mixed = (
         (np.uint64(i) * np.uint64(73856093))
@@ -305,7 +305,7 @@ def _cell_row(i, j, k, mask):
     return np.int64(((mixed * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(24)) & np.uint64(mask))
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _crowds(points, normals, p, other, spacing):
     dx = points[p, 0] - points[other, 0]
     dy = points[p, 1] - points[other, 1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 import json
 from pathlib import Path
 
@@ -77,9 +78,10 @@ class PriorMap:
     def _name(self) -> str:
         return self.source or 'prior map'
 
-    def index(self, reach: float = 0.1) -> VoxelIndex:
-        """Make a new nearest-neighbour index of the map; rows it returns are rows of this map."""
-        return VoxelIndex(self.points, self.normals, reach=reach)
+    @cached_property
+    def index(self) -> VoxelIndex:
+        """Nearest-neighbour index, made once for all users; its rows are rows of this map."""
+        return VoxelIndex(self.points, self.normals)
 
     def save(self, path: str | Path) -> None:
         """

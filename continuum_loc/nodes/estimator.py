@@ -227,11 +227,9 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
-        """Make a filter without a past, which no graph asks for, and with all its memory."""
+        """Make a filter without a past, which no graph asks for."""
         settings = self.filter_settings.model_copy(update={'history': 0.0})
-        made = SlidingWindowFilter(robot, self.prior_map, settings)
-        made.reserve()
-        return made
+        return SlidingWindowFilter(robot, self.prior_map, settings)
 
     def _preset(self) -> EstimatorSettings:
         """Use the settings asked for, else those bundled for this robot, else the library's."""

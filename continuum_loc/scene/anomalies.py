@@ -208,7 +208,7 @@ def detect_anomalies(
     `index`: of `prior`, if there is one already.
     """
     settings = settings or AnomalySettings()
-    index = index or prior.index(reach=0.05)
+    index = index or prior.index
     beams = Beams.of(reconstruction)
     missing = clusters(missing_evidence(beams, prior, settings, index), 'missing', settings)
     behind = behind_map(beams, prior, index, len(reconstruction.points))

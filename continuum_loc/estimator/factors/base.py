@@ -35,17 +35,10 @@ class Setup:
     prior_map: Any = None  # a `PriorMap`, or None
 
     @cached_property
-    def index(self):
-        from continuum_loc.mapping.voxel_index import VoxelIndex
-
-        points, normals = self.prior_map.points, self.prior_map.normals
-        return VoxelIndex(points, normals, reach=self.settings.tof.gate)
-
-    @cached_property
     def surface(self):
         from continuum_loc.estimator.surface import surface_of
 
-        return surface_of(self.prior_map, self.index, self.settings.tof.planarity_power)
+        return surface_of(self.prior_map, self.settings.tof.planarity_power)
 
 
 class FactorReport(NamedTuple):
@@ -157,9 +150,6 @@ class Factor(ABC):
         True if what is matched has to be matched anew.
         """
         return False
-
-    def reserve(self) -> None:  # noqa: B027
-        """Take at once the memory that may be needed in the course of a run."""
 
 
 class Repeats:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from continuum_loc import lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
 from continuum_loc.estimator.normal import add_rows
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import ImuSample
-from numba import njit
 import numpy as np
 
 STANDARD_GRAVITY = 9.80665  # [m/s^2]
@@ -69,7 +69,7 @@ class GravityFactor(Factor):
         return FactorReport(0.5 * squared, squared, 3 * len(batch.times))
 
 
-@njit(cache=True)
+@kernel
 def _add(normal, a, b, batch, up, weight, work):
     """Add the samples; returns the sum of weighted squared residuals."""
     index, weights, J = np.empty(24, np.int64), np.full(3, weight), np.empty((3, 24))

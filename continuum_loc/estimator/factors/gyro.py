@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import (
@@ -17,7 +18,6 @@ from continuum_loc.estimator.factors.base import (
 from continuum_loc.estimator.normal import gather_rows, new_normal, scatter
 from continuum_loc.estimator.state import ends_in_time, NODE_DIM, rows_in_time
 from continuum_loc.measurements import ImuSample
-from numba import njit
 import numpy as np
 
 # An IMU fits while its mean residual is below four sigmas of one sample; rattling averages out.
@@ -117,7 +117,7 @@ class GyroFactor(Factor):
         )
 
 
-@njit(cache=True)
+@kernel
 def _add(normal, a, b, batch, noise, residuals, work):
     """
     Add the samples; returns the robust cost and the sum of weighted squared residuals.
@@ -158,7 +158,7 @@ def _add(normal, a, b, batch, noise, residuals, work):
     return cost, squared
 
 
-@njit(cache=True)
+@kernel
 def _rows_with_bias(column, n, imu, index):
     """Rows (27,) of a node at two knots, with the older knot's bias between them."""
     biases = NODE_DIM * column.T.shape[0]
@@ -168,7 +168,7 @@ def _rows_with_bias(column, n, imu, index):
         index[12 + i] = biases + 3 * imu + i
 
 
-@njit(cache=True)
+@kernel
 def _add_clocks(scores, a, b, batch, work):
     """Add what each sample says by its slope, the acceleration; its squared error as `spread`."""
     slope, index, related = np.empty(3), np.empty(24, np.int64), -1
@@ -192,7 +192,7 @@ def _add_clocks(scores, a, b, batch, work):
                 scores.coupling[index[j], imu] += slope[i] * at.J_rate[3 + i, j]
 
 
-@njit(cache=True)
+@kernel
 def _acceleration(work, time, dt, slope):
     """Write the angular acceleration (3,) at `time`: a difference over CLOCK_STEP either way."""
     t0, t1 = max(time - CLOCK_STEP, 0.0), min(time + CLOCK_STEP, dt)
@@ -203,7 +203,7 @@ def _acceleration(work, time, dt, slope):
         slope[i] = (work[0].v[3 + i] - slope[i]) / (t1 - t0)
 
 
-@njit(cache=True)
+@kernel
 def judge(times, imus, residuals, information, fits, rattle):
     """
     Write [usable, fitting] samples and the variance (3,) of the rattle's angle, by IMU.
@@ -222,7 +222,7 @@ def judge(times, imus, residuals, information, fits, rattle):
             first = m + 1
 
 
-@njit(cache=True)
+@kernel
 def _judge_imu(times, residuals, information, rattle):
     """Write the variance (3,) of one IMU's rattle; whether its mean residual is small enough."""
     count, span = times.shape[0], times[-1] - times[0]

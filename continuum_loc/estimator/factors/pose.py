@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from continuum_loc import lie, lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
 from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import EncoderSample, TrackedPose
-from numba import njit
 import numpy as np
 
 
@@ -120,7 +120,7 @@ class InsertionFactor(_PoseFactor):
         guess.T_map_base = row.T_map_node
 
 
-@njit(cache=True)
+@kernel
 def _add(normal, a, b, batch, cauchy, work):
     """Add the poses; returns the robust cost and the sum of weighted squared residuals."""
     total, local, index = new_normal(24), new_normal(6), np.empty(24, np.int64)
@@ -142,7 +142,7 @@ def _add(normal, a, b, batch, cauchy, work):
     return cost, squared
 
 
-@njit(cache=True)
+@kernel
 def _local(work, T_measured, information, c2, local):
     """Write one pose's normal equations in its own frame; its squared error, and its weight."""
     at = work[0]

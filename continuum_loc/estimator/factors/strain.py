@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, require_finite
 from continuum_loc.estimator.normal import gather, new_normal, Normal, scatter
 from continuum_loc.estimator.state import ends_along, rows_along, STRAIN
 from continuum_loc.measurements import StrainSample
-from numba import njit
 import numpy as np
 
 
@@ -125,7 +125,7 @@ class StrainFactor(Factor):
             guess.strain[:, 4 + i] = np.interp(self.grid.s, row.s[order], bending)
 
 
-@njit(cache=True)
+@kernel
 def _add(normal, a, b, s, batch, cauchy, work):
     """Add the readings; returns the robust cost and the sum of weighted squared residuals."""
     count, dim = batch.segments.shape[0], normal.g.shape[0] // 2
@@ -151,7 +151,7 @@ def _add(normal, a, b, s, batch, cauchy, work):
     return cost, squared
 
 
-@njit(cache=True)
+@kernel
 def _predict(column, s, batch, stations, half, work):
     """Find the stations' bending at the older (half 0) or newer (1) knot."""
     related = -1
@@ -168,7 +168,7 @@ def _predict(column, s, batch, stations, half, work):
                 stations.J[m, 2 * half + i, 24 * half + j] = at.J_rate[4 + i, j]
 
 
-@njit(cache=True)
+@kernel
 def _read(dt, batch, stations, c2):
     """Add what each reading says to its station; returns the robust cost and squared error."""
     cost, squared, share = 0.0, 0.0, np.empty(2)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from continuum_loc import lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import (
@@ -27,7 +28,6 @@ from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.mapping.lookup import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
-from numba import njit
 import numpy as np
 
 MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
@@ -111,7 +111,7 @@ class TofFactor(Factor):
     def __init__(self, setup):
         super().__init__(setup, [sensor.name for sensor in setup.robot.tof])
         self.rate = setup.robot.tof_model.rate
-        self.surface, self._index = setup.surface, setup.index
+        self.surface = setup.surface
         self._repeats = Repeats(MOST_REPEATS)
         self._sensors = {
             sensor.name: (
@@ -164,9 +164,6 @@ class TofFactor(Factor):
             )
         return self.rules.gate != before
 
-    def reserve(self):
-        self._index.reserve()
-
     def row(self, measurement: TofFrame) -> Row:
         number, node, T_ring_sensor = known_sensor(self._sensors, measurement.sensor, 'ToF')
         model = self.robot.tof_model
@@ -212,7 +209,7 @@ def unmatched(zones: int) -> tuple[np.ndarray, np.ndarray]:
     return np.full(zones, -1, np.int64), np.full((zones, 4), np.nan)
 
 
-@njit(cache=True)
+@kernel
 def _read(points, status, T_ring_sensor, optics, q, rays, variance):
     """Write the zones in the ring's frame; the number of usable ones."""
     usable = 0
@@ -235,13 +232,13 @@ def _read(points, status, T_ring_sensor, optics, q, rays, variance):
     return usable
 
 
-@njit(cache=True)
+@kernel
 def frame_of(frames, f):
     """Frame f of many."""
     return Frame(frames.q[f], frames.rays[f], frames.variance[f], frames.hits[f], frames.places[f])
 
 
-@njit(cache=True)
+@kernel
 def _add(normal, a, b, batch, sensors, surface, rules, work):
     """Add the frames; returns robust cost, sum of weighted squared residuals and their number."""
     total, local, index = new_normal(24), new_normal(6), np.empty(24, np.int64)
@@ -268,7 +265,7 @@ def _add(normal, a, b, batch, sensors, surface, rules, work):
     return cost, squared, count
 
 
-@njit(cache=True)
+@kernel
 def _count_flicker(before, frame, tally):
     """Count zones seen in two frames in a row, and those of them that were matched in just one."""
     for z in range(frame.hits.shape[0]):
@@ -278,7 +275,7 @@ def _count_flicker(before, frame, tally):
                 tally[3] += 1.0
 
 
-@njit(cache=True)
+@kernel
 def _add_clocks(scores, a, b, batch, weights, planes, rules, work):
     """Add each frame's v^T g, v^T H v and J^T H v to its sensor's, v the body's velocity then."""
     local, Hv, tally = new_normal(6), np.empty(6), np.empty(4)
@@ -300,7 +297,7 @@ def _add_clocks(scores, a, b, batch, weights, planes, rules, work):
                 scores.coupling[index[j], s] += at.J_pose[i, j] * Hv[i]
 
 
-@njit(cache=True)
+@kernel
 def match(T, frame, lookup, rules):
     """
     Match each zone to the nearest map point that faces its beam, at T_map_body.
@@ -335,7 +332,7 @@ def match(T, frame, lookup, rules):
         frame.hits[rows[k]] = found[k]
 
 
-@njit(cache=True)
+@kernel
 def weigh(T, frame, weight, planes, rules, local, tally):
     """
     Write one frame's normal equations at T_map_body; count its usable and fitting zones.
@@ -378,7 +375,7 @@ def weigh(T, frame, weight, planes, rules, local, tally):
     return cost, squared, count
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _residual(T, q, z, planes, hit, row):
     """Distance of zone z from the plane that it hit, and its derivative by the pose, row (6,)."""
     a, b, c = q[z, 0], q[z, 1], q[z, 2]
@@ -395,7 +392,7 @@ def _residual(T, q, z, planes, hit, row):
     return nx * (x - planes[hit, 0]) + ny * (y - planes[hit, 1]) + nz * (w - planes[hit, 2])
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _spread(frame, z, row, rules):
     """Variance of zone z across a surface whose normal in the node's frame is row[:3]."""
     rays, q = frame.rays, frame.q

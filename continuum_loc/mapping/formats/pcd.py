@@ -12,10 +12,10 @@ import math
 import re
 import struct
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.formats.numbers import cut_error, may_be_cut, table_of, text_of
 from continuum_loc.mapping.formats.shapes import canonical, check_rest, Cloud, cloud_of, USED
-from numba import njit
 import numpy as np
 
 LONGEST_HEADER = 100_000  # bytes
@@ -224,7 +224,7 @@ def _ends(after: int, header: _Header, where: str) -> MapError:
     return MapError(f'{where}: ends after {after} of {header.points} points')
 
 
-@njit(cache=True)
+@kernel
 def _unpack_lzf(packed, content):
     """
     Unpack LZF into `content` and return how many bytes that are; -1 where they do not fit.
