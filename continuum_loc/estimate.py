@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-Status = Literal['initialising', 'tracking', 'lost']
+Status = Literal['initialising', 'tracking', 'doubtful', 'lost']
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +24,9 @@ class Estimate:
     strain, velocity: (R + 1, 6) body-frame generalised strain [nu; omega] and velocity [v; w].
     velocity_covariance: (R + 1, 6, 6).
     backbone_s: (B,) arclengths, evenly spaced; T_map_backbone: (B, 4, 4).
-    status: `initialising` until the first consistent fit, `tracking`, or `lost`.
+    status: `initialising` until the first consistent fit, `tracking` while all is well, `doubtful`
+    while the measurements contradict the description or one another, or `lost`.
+    doubts: why the status is `doubtful`, in words.
     consistency: mean normalised innovation squared per measured dimension in the window (1 when
     honest).
     inliers: share of usable zones that fit the map, by ToF sensor.
@@ -44,6 +46,7 @@ class Estimate:
     consistency: float
     inliers: dict[str, float] = field(default_factory=dict)
     suspects: dict[str, str] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
     iterations: int = 0
     converged: bool = True
     step_seconds: float = 0.0

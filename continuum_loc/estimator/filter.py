@@ -14,8 +14,9 @@ from operator import itemgetter
 import time as clock
 
 from continuum_loc.errors import MeasurementError, SingularError
-from continuum_loc.estimate import Estimate
+from continuum_loc.estimate import Estimate, Status
 from continuum_loc.estimator.cycle import Cycle
+from continuum_loc.estimator.doubts import Doubts
 from continuum_loc.estimator.factors import Factor, FACTORS, Guess, Setup
 from continuum_loc.estimator.fit import Fit, fit_of, rattle
 from continuum_loc.estimator.health import Health
@@ -71,6 +72,7 @@ class SlidingWindowFilter:
         self.recovery = Recovery(
             self.robot, self.window, self.factors, self.health, self.settings.recovery
         )
+        self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle = Cycle(self.factors, self.settings.output_rate)
 
@@ -146,6 +148,7 @@ class SlidingWindowFilter:
             self.newest = max(self.newest, measurement.stamp)
             self._awaited.discard(type(measurement))
             self._rest.note(measurement)
+            self.doubts.note(measurement, time)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
         return any(used)
 
@@ -196,6 +199,8 @@ class SlidingWindowFilter:
             self.window.keep_newest(1)
             outcome = self.recovery.acquire()
         self._rest.finish(self.window, time)
+        self.doubts.look(time, self.epoch)
+        self.health.hear_of(self.doubts)
         self.recovery.look_after(time, outcome[1])
         self.history.note(self.window)
         return outcome
@@ -218,6 +223,11 @@ class SlidingWindowFilter:
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
             lagged = self._compose(before, fit, outcome, started)
         return self._compose(now, fit, outcome, started, lagged)
+
+    def _status(self) -> Status:
+        """Say what to tell of the body; nothing but an undisputed fit is tracking."""
+        status = self.recovery.status
+        return 'doubtful' if status == 'tracking' and self.doubts.reasons else status
 
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:
         """
@@ -254,7 +264,8 @@ class SlidingWindowFilter:
             velocity_covariance=covariance[:, 6:, 6:],
             backbone_s=self._backbone_s,
             T_map_backbone=backbone(self.grid, body.T, body.strain, self._backbone_s),
-            status=self.recovery.status,
+            status=self._status(),
+            doubts=self.doubts.reasons,
             consistency=fit.squared / max(fit.count, 1),
             inliers=fit.shares,
             suspects=dict(self.health.reasons),

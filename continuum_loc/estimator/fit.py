@@ -32,6 +32,27 @@ def fit_of(intervals: Sequence[Interval]) -> Fit:
     )
 
 
+def misfit_by_factor(intervals: Sequence[Interval]) -> dict[str, float]:
+    """Mean squared normalised residual of each factor's measurements."""
+    sums: dict[str, np.ndarray] = {}
+    for interval in intervals:
+        for factor, report in interval.reports.items():
+            part = np.array([report.squared, report.count])
+            sums[factor.name] = sums.get(factor.name, 0.0) + part
+    return {name: float(squared / max(count, 1)) for name, (squared, count) in sums.items()}
+
+
+def consistency(intervals: Sequence[Interval], without: str = '') -> float:
+    """Mean squared normalised residual of all factors but one; 1 where the noise is as stated."""
+    squared, count = 0.0, 0
+    for interval in intervals:
+        for factor, report in interval.reports.items():
+            if factor.name != without:
+                squared += report.squared
+                count += report.count
+    return squared / max(count, 1)
+
+
 def newest_fits(intervals: Sequence[Interval], factor: Factor) -> dict[str, np.ndarray]:
     """[usable, fitting] samples by sensor, in the newest interval that has this factor."""
     for interval in reversed(intervals):

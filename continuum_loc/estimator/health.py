@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from continuum_loc.estimator.clocks import ClockEvidence, ClockOffset
+from continuum_loc.estimator.doubts import Doubts
 from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.fit import fit_of, flicker
 from continuum_loc.estimator.settings import HealthSettings
@@ -23,6 +24,7 @@ RECENT = 2  # intervals that say whether a ToF sensor fits now
 CERTAIN = 2.0  # times the deviations asked for, and one test will do
 MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
 KNOWN_FOR = 1.0  # [s] that what was found of the clocks holds without another test
+FIRST_CLOCKS = 1.0  # [s] of data: before, the body still finds its place
 STILL_SIGMAS = 3.0  # for a clock known to be off
 NOISY, MISFIT = 'noisy', 'does not fit'
 
@@ -42,6 +44,10 @@ class Health:
         settings: HealthSettings,
     ):
         self.reasons: dict[str, str] = {}
+        self.told: dict[str, str] = {}  # causes that were found otherwise
+        # About to accuse a clock: is there another explanation? And whether that was looked for.
+        self.asks, self.answered = False, False
+        self.waiting = False  # for an explanation, before which nobody is accused of not fitting
         self._robot, self._window, self._factors, self._settings = robot, window, factors, settings
         self._heard: dict[str, float] = {}
         used = {name for factor in factors for name in factor.sensors}
@@ -50,7 +56,7 @@ class Health:
         self._clock_groups = self._groups()
         self._votes: dict[tuple[str, ...], int] = {}
         self._late: dict[tuple[str, ...], ClockOffset] = {}
-        self._next_clocks = self._clocks_known = 0.0
+        self._next_clocks, self._clocks_known = FIRST_CLOCKS, 0.0
 
     @property
     def disbelieved(self) -> set[str]:
@@ -60,6 +66,12 @@ class Health:
     def hear(self, sensor: str, time: float) -> None:
         """Note that a sensor gave a usable sample at `time` [s]."""
         self._heard[sensor] = max(time, self._heard.get(sensor, time))
+
+    def hear_of(self, doubts: Doubts) -> None:
+        """Take over what causes were found, and ask whether there are others."""
+        self.told, self.waiting = doubts.causes, doubts.pending
+        self.answered = doubts.answered
+        doubts.asked = self.asks
 
     def look(self, time: float, body_believed: bool, body_doubted: bool) -> None:
         """
@@ -71,15 +83,17 @@ class Health:
         """
         reasons = dict.fromkeys(self._noisy(), NOISY)
         for name in self._misfits():
-            if body_believed or name in self.disbelieved or name not in self._tof_names:
+            known = name in self.disbelieved
+            if known or not self.waiting and (body_believed or name not in self._tof_names):
                 reasons[name] = MISFIT
-        if not body_doubted and MISFIT not in reasons.values():
+        if not (body_doubted or self.waiting or MISFIT in reasons.values()):
             self._look_at_clocks(time)
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}
         for clock in self._late.values():
             reasons.update(dict.fromkeys(clock.sensors, _lateness(clock)))
         reasons.update(dict.fromkeys(self._silent(time), 'silent'))
+        reasons.update(self.told)
         self.reasons = reasons
         self._count()
 
@@ -129,7 +143,9 @@ class Health:
         if np.max(evidence.spread, initial=0.0) <= MOST_SPREAD:
             self._clocks_known = time
             still = self._still_off(evidence)
-            self._late = still | self._newly_off(evidence, still)
+            new = self._newly_off(evidence, still)
+            self.asks = bool(new) and not self.answered
+            self._late = still if self.asks else still | new
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}  # a body that rattles says nothing of clocks
 

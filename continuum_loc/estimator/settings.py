@@ -269,6 +269,24 @@ class HealthSettings(Settings):
     )
 
 
+class DoubtSettings(Settings):
+    """When the filter doubts what it is told, and itself."""
+
+    enabled: bool = Field(True, description='whether causes are looked for')
+    period: float = Field(
+        0.4, gt=0.0, description='time between two comparisons of units, axes and signs [s]'
+    )
+    uneasy: float = Field(
+        1.5,
+        gt=0.0,
+        description='mean normalised square beyond which an explanation is looked for',
+    )
+    patience: float = Field(0.3, ge=0.0, description='time that this must last [s]')
+    consistency: float = Field(
+        3.0, gt=0.0, description='mean normalised square beyond which an estimate is doubtful'
+    )
+
+
 class EstimatorSettings(Settings):
     """The sliding-window filter."""
 
@@ -302,6 +320,7 @@ class EstimatorSettings(Settings):
     solver: SolverSettings = SolverSettings()
     recovery: RecoverySettings = RecoverySettings()
     health: HealthSettings = HealthSettings()
+    doubts: DoubtSettings = DoubtSettings()
 
 
 def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSettings:

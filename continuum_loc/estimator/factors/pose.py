@@ -18,10 +18,14 @@ from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import EncoderSample, TrackedPose
 import numpy as np
 
+FIT_SQUARED = 27.9  # chi-squared of six degrees of freedom at 1e-4
+LEAST_WEIGHT = 0.01  # of what a doubted sensor of another kind counts by
+
 
 class Row(NamedTuple):
     """One pose of a node (4, 4), and its information (6, 6) in the node's frame."""
 
+    sensor: int
     node: int
     T_map_node: np.ndarray
     information: np.ndarray
@@ -29,9 +33,18 @@ class Row(NamedTuple):
 
 class Batch(NamedTuple):
     times: np.ndarray
+    sensors: np.ndarray
     nodes: np.ndarray
     T_map_node: np.ndarray
     information: np.ndarray
+
+
+class Loss(NamedTuple):
+    """Scale of the robust loss, what each of S sensors counts by, and its [usable, fitting]."""
+
+    cauchy: float
+    weights: np.ndarray
+    fits: np.ndarray
 
 
 class _PoseFactor(Factor):
@@ -43,9 +56,20 @@ class _PoseFactor(Factor):
         return super().stack(times[order], [rows[m] for m in order])
 
     def linearise(self, batch, a, b, normal):
-        cost, squared = _add(normal, a, b, batch, self.cauchy, self._work)
+        fits = np.zeros((len(self.sensors), 2))
+        loss = Loss(self.cauchy, self.weights, fits)
+        cost, squared = _add(normal, a, b, batch, loss, self._work)
         observed = np.diagonal(batch.information, axis1=1, axis2=2) > 0.0
-        return FactorReport(cost, squared, int(np.sum(observed)))
+        told = fits if self.robust else None
+        return FactorReport(cost, squared, int(np.sum(observed)), told)
+
+    @property
+    def robust(self) -> bool:
+        return bool(np.isfinite(self.cauchy))
+
+    def weigh(self, doubted, weight):
+        # A pose says all of its node at once, and an encoder has no loss: 5 % would be too much.
+        return super().weigh(doubted, LEAST_WEIGHT * weight)
 
 
 class TrackerFactor(_PoseFactor):
@@ -55,21 +79,22 @@ class TrackerFactor(_PoseFactor):
     consumes = TrackedPose
 
     def __init__(self, setup):
-        super().__init__(setup)
+        super().__init__(setup, [sensor.name for sensor in setup.robot.trackers])
         options = self.settings.tracker
         self.cauchy = options.cauchy
         self._sensors = {
             sensor.name: (
+                number,
                 self.grid.node_at(self.robot.sensor_arclength(sensor.name)),
                 lie.inverse(sensor.mount.T_ring_sensor),
             )
-            for sensor in self.robot.trackers
+            for number, sensor in enumerate(self.robot.trackers)
         }
         turn = np.radians(options.sigma_rotation_deg)
         self._default = np.array([options.sigma_position] * 3 + [turn] * 3) ** -2.0
 
     def row(self, measurement: TrackedPose) -> Row:
-        node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, 'tracker')
+        number, node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, 'tracker')
         require_finite(measurement.T_map_sensor, 'pose', measurement.sensor)
         Ad = lie.adjoint(lie.inverse(T_sensor_ring))  # sensor-frame covariance to the ring's frame
         information = np.diag(self._default)
@@ -82,7 +107,7 @@ class TrackerFactor(_PoseFactor):
                     'bad covariance',
                     f"covariance of '{measurement.sensor}' is not positive definite",
                 ) from None
-        return Row(node, measurement.T_map_sensor @ T_sensor_ring, information)
+        return Row(number, node, measurement.T_map_sensor @ T_sensor_ring, information)
 
 
 class InsertionFactor(_PoseFactor):
@@ -90,6 +115,9 @@ class InsertionFactor(_PoseFactor):
 
     name = 'insertion'
     consumes = EncoderSample
+
+    def __init__(self, setup):
+        super().__init__(setup, ['insertion'])
 
     @classmethod
     def wanted(cls, setup):
@@ -111,7 +139,7 @@ class InsertionFactor(_PoseFactor):
         T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
         information[0, 0] = insertion.sigma**-2.0
-        return Row(0, T_map_base, information)
+        return Row(0, 0, T_map_base, information)
 
     def awaited(self):
         return self.robot.base.insertion.mode == 'measured'
@@ -121,10 +149,10 @@ class InsertionFactor(_PoseFactor):
 
 
 @kernel
-def _add(normal, a, b, batch, cauchy, work):
+def _add(normal, a, b, batch, loss, work):
     """Add the poses; returns the robust cost and the sum of weighted squared residuals."""
     total, local, index = new_normal(24), new_normal(6), np.empty(24, np.int64)
-    product, c2 = np.empty((6, 24)), cauchy * cauchy
+    product, c2 = np.empty((6, 24)), loss.cauchy * loss.cauchy
     cost, squared, related = 0.0, 0.0, -1
     for m in range(batch.times.shape[0]):
         n = batch.nodes[m]
@@ -132,12 +160,22 @@ def _add(normal, a, b, batch, cauchy, work):
             gp.relate(ends_in_time(a, b, n), work)
             related = n
         gp.evaluate(work, batch.times[m], True, 6)
+        sensor = batch.sensors[m]
+        weight = loss.weights[sensor]
         u2, robust = _local(work, batch.T_map_node[m], batch.information[m], c2, local)
+        for i in range(6):
+            local.g[i] *= weight
+            for j in range(6):
+                local.H[i, j] *= weight
         gather(total, local, work[0].J_pose, product)
+        loss.fits[sensor, 0] += 1.0
+        if u2 < FIT_SQUARED:
+            loss.fits[sensor, 1] += 1.0
         if m + 1 == batch.times.shape[0] or batch.nodes[m + 1] != n:
             rows_in_time(n, normal.g.shape[0] // 2, index)
             scatter(normal, index, total, 1.0)
-        cost += 0.5 * u2 if np.isinf(cauchy) else 0.5 * c2 * np.log1p(u2 / c2)
+        own = 0.5 * u2 if np.isinf(loss.cauchy) else 0.5 * c2 * np.log1p(u2 / c2)
+        cost += weight * own
         squared += u2 * robust
     return cost, squared
 

@@ -53,12 +53,22 @@ class Stations(NamedTuple):
     g: np.ndarray  # (S, 4)
 
 
+class Loss(NamedTuple):
+    """Scale of the robust loss, and what the sensor counts by."""
+
+    cauchy: float
+    weight: float
+
+
 class StrainFactor(Factor):
     """Bending strain at any stations, by the Hermite in arclength and linearly in time."""
 
     name = 'strain'
     consumes = StrainSample
     batch = Batch
+
+    def __init__(self, setup):
+        super().__init__(setup, ['strain'])
 
     def row(self, measurement: StrainSample) -> Row:
         if self.robot.strain is None:
@@ -110,9 +120,8 @@ class StrainFactor(Factor):
         )
 
     def linearise(self, batch, a, b, normal):
-        cost, squared = _add(
-            normal, a, b, self.grid.s, batch, self.settings.strain.cauchy, self._work
-        )
+        loss = Loss(self.settings.strain.cauchy, self.weights[0])
+        cost, squared = _add(normal, a, b, self.grid.s, batch, loss, self._work)
         return FactorReport(cost, squared, 2 * len(batch.times))
 
     def awaited(self):
@@ -126,7 +135,7 @@ class StrainFactor(Factor):
 
 
 @kernel
-def _add(normal, a, b, s, batch, cauchy, work):
+def _add(normal, a, b, s, batch, loss, work):
     """Add the readings; returns the robust cost and the sum of weighted squared residuals."""
     count, dim = batch.segments.shape[0], normal.g.shape[0] // 2
     stations = Stations(
@@ -137,7 +146,7 @@ def _add(normal, a, b, s, batch, cauchy, work):
     )
     _predict(a, s, batch, stations, 0, work)
     _predict(b, s, batch, stations, 1, work)
-    cost, squared = _read(b.time - a.time, batch, stations, cauchy * cauchy)
+    cost, squared = _read(b.time - a.time, batch, stations, loss.cauchy * loss.cauchy)
     index, product, total = np.empty(48, np.int64), np.empty((4, 48)), new_normal(48)
     for m in range(count):
         n = batch.segments[m]
@@ -147,8 +156,8 @@ def _add(normal, a, b, s, batch, cauchy, work):
         rows_along(n, STRAIN, index)
         for i in range(24):
             index[24 + i] = dim + index[i]
-        scatter(normal, index, total, 1.0)
-    return cost, squared
+        scatter(normal, index, total, loss.weight)
+    return loss.weight * cost, squared
 
 
 @kernel
