@@ -1,10 +1,7 @@
-"""
-The filter as a whole in an analytic world.
+"""The filter as a whole in an analytic world: accuracy, honesty, bad data, lost and found."""
 
-Accuracy, honesty, late and bad data, being lost and found.
-"""
-
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from continuum_loc import lie
 from continuum_loc.estimator import (
@@ -13,9 +10,17 @@ from continuum_loc.estimator import (
     SlidingWindowFilter,
     smooth,
 )
+from continuum_loc.estimator import (
+    filter as filter_module,
+)
+from continuum_loc.estimator.factors import Factor, FactorReport, FACTORS
+from continuum_loc.estimator.interpolation import interpolated
+from continuum_loc.estimator.normal import add_rows
 from continuum_loc.estimator.recovery import SHARE_SLACK, Try
-from continuum_loc.measurements import ImuSample, StrainSample, TofFrame, TruthSample
-from continuum_loc.robot import load_robot
+from continuum_loc.estimator.solver import track
+from continuum_loc.estimator.state import rows_in_time
+from continuum_loc.measurements import ImuSample, StrainSample, TofFrame, TrackedPose, TruthSample
+from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.world import World
 import numpy as np
@@ -102,6 +107,94 @@ def test_the_same_measurements_give_the_same_estimate(prior_map):
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a.T_map_ring, b.T_map_ring)
         np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_a_filter_after_reset_is_as_a_new_one(prior_map):
+    """It forgets a frozen sensor's last frame, whom it did not believe, and where the body was."""
+    robot, turn = rod(), lie.exp(np.radians([0, 0, 0, 0, 0, 20.0]))[:3, :3]
+    clean, disturbed, first = list(stream(Rod(robot, seed=6), 1.5)), [], {}
+    for s in clean:
+        if isinstance(s, TofFrame) and s.sensor == 'r1_tof0':
+            s = replace(first.setdefault('frame', s), stamp=s.stamp)
+        if isinstance(s, TofFrame) and s.sensor == 'r2_tof1':
+            s = replace(s, points=s.points @ turn.T)
+        disturbed.append(s)
+    used, new = (SlidingWindowFilter(robot, prior_map, settings()) for _ in range(2))
+    suspects = run(used, disturbed)[0][-1].suspects
+    assert set(suspects) == {'r1_tof0', 'r2_tof1'}
+    before = used.counts['dropped'].copy()
+    used.reset()
+    again, fresh = (run(filter_, clean)[0] for filter_ in (used, new))
+    assert used.counts['dropped'] == before
+    for a, b in zip(again, fresh, strict=True):
+        assert (a.stamp, a.status, a.suspects, a.inliers) == (
+            b.stamp,
+            b.status,
+            b.suspects,
+            b.inliers,
+        )
+        np.testing.assert_array_equal(a.T_map_ring, b.T_map_ring)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+        np.testing.assert_array_equal(a.lagged is None, b.lagged is None)
+    for time in (0.3, 1.2):
+        one, other = (f.query(EPOCH + round(time * 1e9), 0.4) for f in (used, new))
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+@dataclass(frozen=True)
+class Height:
+    """How high the tip is: the sample of a sensor that the package does not know."""
+
+    stamp: int
+    z: float
+
+
+class HeightRow(NamedTuple):
+    z: float
+
+
+class HeightBatch(NamedTuple):
+    times: np.ndarray
+    z: np.ndarray
+
+
+class HeightFactor(Factor):
+    name = 'height'
+    consumes = Height
+    batch = HeightBatch
+    sigma = 1e-3
+
+    @classmethod
+    def wanted(cls, setup):
+        return True
+
+    def row(self, measurement):
+        return HeightRow(measurement.z)
+
+    def linearise(self, batch, a, b, normal):
+        tip = np.full(len(batch.z), self.grid.nodes - 1)
+        at, index = interpolated(a, b, batch.times, tip, pose=True), np.empty(24, np.int64)
+        rows_in_time(self.grid.nodes - 1, self.grid.dim, index)
+        squared = 0.0
+        for m, z in enumerate(batch.z):
+            J = at.T[m, 2, :3] @ at.J_pose[m, :3]  # dz = e_z^T R rho
+            e = np.array([at.T[m, 2, 3] - z])
+            squared += add_rows(normal, index, e, J[None], np.full(1, self.sigma**-2.0))
+        return FactorReport(0.5 * squared, squared, len(batch.z))
+
+
+def test_a_sensor_of_ones_own_is_a_factor_and_an_entry(monkeypatch):
+    """Told its tip's height to 1 mm ten times a second, a blind arm knows it to less than that."""
+    monkeypatch.setattr(filter_module, 'FACTORS', (*FACTORS, HeightFactor))
+    robot = rod(strain=False, tof=False)
+    filter_ = SlidingWindowFilter(robot, None, settings())
+    for k in range(20):
+        filter_.process(Height(EPOCH + k * 100_000_000, 0.02))
+    estimate = filter_.flush()
+    assert filter_.counts['used']['Height'] == 20
+    up = estimate.T_map_ring[-1, 2, :3]  # e_z in the tip's frame
+    assert estimate.T_map_ring[-1, 2, 3] == pytest.approx(0.02, abs=1e-3)
+    assert up @ estimate.covariance[-1, :3, :3] @ up < HeightFactor.sigma**2
 
 
 def test_order_within_the_window_does_not_matter_and_older_data_is_dropped_and_counted(prior_map):
@@ -217,6 +310,26 @@ def test_finds_itself_from_the_base_alone(prior_map, seed):
     assert np.max(np.abs(errors(estimates, truth)[-5:, 1:, :3])) < 0.01
 
 
+def test_finds_itself_with_a_ring_on_the_base(prior_map):
+    """A ring at s = 0, as a tracker of the base has, leaves the search no segment before it."""
+    plain = rod(strain=False)
+    data = plain.model_dump()
+    data['rings'] = [{'name': 'r0', 's': 0.0}, *data['rings']]
+    data['trackers'] = [{'name': 'coil', 'ring': 'r0'}]
+    robot = parse_settings(RobotDescription, data)
+    filter_ = SlidingWindowFilter(robot, prior_map, settings(recovery={'max_curvature': 2.0}))
+    T_ring_coil, samples = robot.trackers[0].mount.T_ring_sensor, []
+    for sample in stream(Rod(plain, seed=1, amplitude=1.8), 1.0, start=2.0):
+        samples.append(sample)
+        if isinstance(sample, TruthSample):
+            coil = sample.T_map_ring[0] @ T_ring_coil
+            samples.append(TrackedPose(sample.stamp, 'coil', coil))
+    estimates, truth = run(filter_, samples)
+    last = [e for e in estimates if e.stamp in truth][-5:]
+    off = [e.T_map_ring[[0, 2, 3], :3, 3] - truth[e.stamp][:, :3, 3] for e in last]
+    assert np.max(np.abs(off)) < 0.01
+
+
 def test_an_estimate_that_is_called_converged_stays_where_it_is_when_solved_on(prior_map):
     """Convergence is judged at the estimate's stamp, not at the column ahead of the data."""
     robot, moved = rod(), []
@@ -225,7 +338,7 @@ def test_an_estimate_that_is_called_converged_stays_where_it_is_when_solved_on(p
     for sample in stream(Rod(robot, amplitude=2.0), 3.0):
         estimate = None if isinstance(sample, TruthSample) else filter_.process(sample)
         if estimate is not None and estimate.converged:
-            filter_.window.track()
+            track(filter_.window)
             later = filter_.window.body((estimate.stamp - filter_.epoch) / 1e9)
             step = lie.log(lie.inverse(estimate.T_map_ring) @ later.T[filter_.grid.ring_nodes])
             moved.append(np.abs(step).max())
@@ -365,9 +478,10 @@ def test_a_window_restored_knows_what_it_knew(prior_map):
     kept = window.snapshot()
     window.keep_newest(2)
     window.place(window.columns[-1].predict(0.5))
-    window.track()
+    track(window)
     assert not np.allclose(window.motion_covariance(time, rings), covariance, rtol=0.1)
     window.restore(kept)
+    track(window)
     np.testing.assert_allclose(window.body(time).T, body.T, atol=1e-4)
     np.testing.assert_allclose(
         np.trace(window.motion_covariance(time, rings), axis1=1, axis2=2),

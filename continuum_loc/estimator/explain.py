@@ -17,6 +17,7 @@ from typing import NamedTuple
 from continuum_loc.errors import MeasurementError, SingularError
 from continuum_loc.estimator.factors import FACTORS, Setup
 from continuum_loc.estimator.priors import Priors
+from continuum_loc.estimator.solver import acquire
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
     EncoderSample,
@@ -99,7 +100,7 @@ class Stretch:
             return None
         window.set_columns(columns[: len(window.columns)])
         try:
-            acquire(window, factors)
+            from_a_guess(window, factors)
         except SingularError:
             return None
         costs: dict[str, float] = {}
@@ -129,7 +130,7 @@ def base_freed(robot: RobotDescription) -> RobotDescription:
     return robot.model_copy(update={'base': base.model_copy(update=loose)})
 
 
-def acquire(window: Window, factors: Sequence) -> tuple[int, bool]:
+def from_a_guess(window: Window, factors: Sequence) -> tuple[int, bool]:
     """Solve a window from a guess, matching widely at first: (iterations, whether converged)."""
 
     def loosen(iteration: int) -> bool:
@@ -139,7 +140,7 @@ def acquire(window: Window, factors: Sequence) -> tuple[int, bool]:
         return all(factor.tight for factor in factors)
 
     try:
-        return window.acquire(loosen)
+        return acquire(window, loosen)
     finally:
         for factor in factors:
             factor.loosen(0)

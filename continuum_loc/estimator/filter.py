@@ -26,6 +26,7 @@ from continuum_loc.estimator.query import History, state_at
 from continuum_loc.estimator.recovery import Recovery
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.estimator.solver import track
 from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import Measurement, nanoseconds, seconds
@@ -192,7 +193,7 @@ class SlidingWindowFilter:
             self._guess()
         try:
             outcome = (
-                self.window.track(time) if self.recovery.acquired else self.recovery.acquire()
+                track(self.window, time) if self.recovery.acquired else self.recovery.acquire()
             )
         except SingularError:
             self.counts['restarts']['singular'] += 1

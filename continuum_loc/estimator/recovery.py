@@ -17,6 +17,7 @@ from continuum_loc.estimator.fit import fit_of, measurement_cost, newest_fits
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.search import ShapeSearch, Snapshot
 from continuum_loc.estimator.settings import RecoverySettings
+from continuum_loc.estimator.solver import acquire, track
 from continuum_loc.estimator.state import Column, column_at_rest
 from continuum_loc.estimator.window import Window
 from continuum_loc.robot import RobotDescription
@@ -111,7 +112,7 @@ class Recovery:
     def acquire(self) -> tuple[int, bool]:
         """Solve the window from a guess, matching widely: (iterations, whether it converged)."""
         try:
-            return self._window.acquire(self._loosen)
+            return acquire(self._window, self._loosen)
         finally:
             self._loosen(0)
 
@@ -191,6 +192,7 @@ class Recovery:
         chosen = min(better, key=_cost, default=mine)
         if past is not None and chosen is mine:
             window.restore(past)  # nothing better was found: what was known before still is
+            track(window)
         else:
             window.set_columns(chosen.columns)
             self._refine()

@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 from continuum_loc import lie
 from continuum_loc.compiling import kernel
-from continuum_loc.estimator.factors.tof import Frame, match, Row, Rules, TofFactor, weigh
+from continuum_loc.estimator.factors.tof import Row, TofFactor
+from continuum_loc.estimator.matching import Frame, match, Rules, Surface, thinned, weigh
 from continuum_loc.estimator.normal import new_normal
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import RecoverySettings
 from continuum_loc.estimator.state import Grid
-from continuum_loc.estimator.surface import Surface, thinned
 import numpy as np
 
 # [m] of the thinned map that the search scores against; it has to tell decimetres apart.
@@ -54,6 +54,9 @@ class ShapeSearch:
 
     def __init__(self, grid: Grid, tof: TofFactor, settings: RecoverySettings, priors: Priors):
         self.grid, self.settings, self.rest = grid, settings, priors.rest
+        # Base and rings, each place once: a ring on the base has no segment of its own.
+        self._nodes = np.unique(grid.ring_nodes)
+        self._s = grid.s[self._nodes]
         options, self._tof = tof.settings.tof, tof
         self._thinned: Surface | None = None
         self._rules = Rules(
@@ -79,12 +82,9 @@ class ShapeSearch:
 
     def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
         """Strain (N, 6) at the nodes of the best shapes, best first."""
-        rings = self.grid.ring_nodes
-        T, cost = T_map_base[None], np.zeros(1)
-        bends = np.zeros((1, 0, 2))
-        for ring in range(1, len(rings)):
-            length = self.grid.s[rings[ring]] - self.grid.s[rings[ring - 1]]
-            T, cost, bends = self._extend(T, cost, bends, length, snapshot.at(rings[ring]))
+        T, cost, bends = T_map_base[None], np.zeros(1), np.zeros((1, 0, 2))
+        for node, length in zip(self._nodes[1:], np.diff(self._s), strict=True):
+            T, cost, bends = self._extend(T, cost, bends, length, snapshot.at(node))
         return [self._strain_at_nodes(bend) for bend in bends[: self.settings.refined]]
 
     def _extend(self, T, cost, bends, length, snapshot):
@@ -118,10 +118,10 @@ class ShapeSearch:
 
     def _strain_at_nodes(self, bends: np.ndarray) -> np.ndarray:
         """Strain (N, 6) whose curvature runs through the segments' curvatures at their middles."""
-        s = self.grid.s[self.grid.ring_nodes]
+        middles = 0.5 * (self._s[1:] + self._s[:-1])
         strain = np.tile(self.rest, (self.grid.nodes, 1))
         for i in range(2):
-            strain[:, 4 + i] += np.interp(self.grid.s, 0.5 * (s[1:] + s[:-1]), bends[:, i])
+            strain[:, 4 + i] += np.interp(self.grid.s, middles, bends[:, i])
         return strain
 
 

@@ -18,9 +18,11 @@ from typing import Any, ClassVar, NamedTuple
 
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
+from continuum_loc.estimator.matching import Surface, surface_of
 from continuum_loc.estimator.normal import Normal
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
+from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.robot import RobotDescription
 import numpy as np
 
@@ -32,12 +34,10 @@ class Setup:
     robot: RobotDescription
     grid: Grid
     settings: EstimatorSettings
-    prior_map: Any = None  # a `PriorMap`, or None
+    prior_map: PriorMap | None = None
 
     @cached_property
-    def surface(self):
-        from continuum_loc.estimator.surface import surface_of
-
+    def surface(self) -> Surface:
         return surface_of(self.prior_map, self.settings.tof.planarity_power)
 
 

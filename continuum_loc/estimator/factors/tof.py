@@ -1,11 +1,8 @@
 """
-ToF: point-to-plane against the prior map (paper eqs. 1-4).
+ToF: the zones of a frame against the prior map.
 
-All zones of one frame share (s, t), so their residuals gather in one 6x6 information block in the
-body frame, which is chained once through the interpolation. With b = R^T n the row of a zone is
-[b, q x b] for a right perturbation. The noise acts along the beam: a hit at incidence n . d counts
-with variance sigma_d^2 (n . d)^2 plus the floor. A zone is matched to the map anew once it has
-moved.
+`matching` makes one 6x6 information of the body's pose of all zones of a frame; here it is chained
+through the interpolation.
 """
 
 from __future__ import annotations
@@ -24,32 +21,15 @@ from continuum_loc.estimator.factors.base import (
     known_sensor,
     Repeats,
 )
+from continuum_loc.estimator.matching import Frame, frame_of, match, Rules, unmatched, weigh
 from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
-from continuum_loc.mapping.lookup import nearest_facing_batch
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 import numpy as np
 
 MOST_REPEATS = 2  # frames: the noise of 64 zones never repeats
-FIT_SIGMAS = 3.0  # a zone within so many sigmas of its surface counts as fitting
 HALF_CONFIDENCE_VARIANCE = 4.0  # status 6 and 9 are right half of the time
 GATE_SHRINK = 0.75  # of the gate of association, at each iteration from a guess
-
-
-class Frame(NamedTuple):
-    """
-    A frame's zones, and what of the map they are matched to.
-
-    q: (Z, 3) where they hit in the node's frame [m]; rays: (Z, 3) their beams; variance: (Z,) of
-    their ranges [m^2], infinite where a zone is of no use; hits: (Z,) rows of the map, -1 where
-    there is none; places: (Z, 4) where the zone was then [m], and the gate.
-    """
-
-    q: np.ndarray
-    rays: np.ndarray
-    variance: np.ndarray
-    hits: np.ndarray
-    places: np.ndarray
 
 
 @dataclass(slots=True, eq=False)
@@ -72,17 +52,6 @@ class Batch(NamedTuple):
     sensors: np.ndarray
     nodes: np.ndarray
     frames: Frame
-
-
-class Rules(NamedTuple):
-    """How zones are matched, and how they count."""
-
-    gate: float  # [m] farthest map point
-    min_cosine: float  # of incidence
-    reassociate: float  # [m] move beyond which a zone is matched anew
-    floor2: float  # [m^2] noise across the surface
-    footprint: float  # [rad] half width of a zone that counts as noise
-    cauchy: float
 
 
 class Sensors(NamedTuple):
@@ -204,11 +173,6 @@ class TofFactor(Factor):
         return scores._replace(spread=np.ones(len(self.sensors)))  # the loss took care of outliers
 
 
-def unmatched(zones: int) -> tuple[np.ndarray, np.ndarray]:
-    """Make hits and places of zones that were never matched."""
-    return np.full(zones, -1, np.int64), np.full((zones, 4), np.nan)
-
-
 @kernel
 def _read(points, status, T_ring_sensor, optics, q, rays, variance):
     """Write the zones in the ring's frame; the number of usable ones."""
@@ -230,12 +194,6 @@ def _read(points, status, T_ring_sensor, optics, q, rays, variance):
         sigma = np.interp(distance, optics.distance, optics.coefficient) * distance
         variance[z] = sigma * sigma * (HALF_CONFIDENCE_VARIANCE if half else 1.0)
     return usable
-
-
-@kernel
-def frame_of(frames, f):
-    """Frame f of many."""
-    return Frame(frames.q[f], frames.rays[f], frames.variance[f], frames.hits[f], frames.places[f])
 
 
 @kernel
@@ -295,108 +253,3 @@ def _add_clocks(scores, a, b, batch, weights, planes, rules, work):
             scores.information[s] += Hv[i] * at.v[i]
             for j in range(24):
                 scores.coupling[index[j], s] += at.J_pose[i, j] * Hv[i]
-
-
-@kernel
-def match(T, frame, lookup, rules):
-    """
-    Match each zone to the nearest map point that faces its beam, at T_map_body.
-
-    A zone that moved by no more than `reassociate` since it was matched with this gate keeps its
-    hit.
-    """
-    q, rays, places, gate = frame.q, frame.rays, frame.places, rules.gate
-    zones, asked = q.shape[0], 0
-    points, directions = np.empty((zones, 3)), np.empty((zones, 3))
-    rows, found, distance2 = np.empty(zones, np.int64), np.empty(zones, np.int64), np.empty(zones)
-    for z in range(zones):
-        if not np.isfinite(frame.variance[z]):
-            continue
-        moved2 = 0.0
-        for i in range(3):
-            points[asked, i] = T[i, 0] * q[z, 0] + T[i, 1] * q[z, 1] + T[i, 2] * q[z, 2] + T[i, 3]
-            moved2 += (points[asked, i] - places[z, i]) ** 2
-        if places[z, 3] == gate and moved2 <= rules.reassociate * rules.reassociate:
-            continue
-        for i in range(3):
-            places[z, i] = points[asked, i]
-            directions[asked, i] = (
-                T[i, 0] * rays[z, 0] + T[i, 1] * rays[z, 1] + T[i, 2] * rays[z, 2]
-            )
-        places[z, 3] = gate
-        rows[asked] = z
-        asked += 1
-    points, directions = points[:asked], directions[:asked]
-    nearest_facing_batch(lookup, points, directions, gate, rules.min_cosine, found, distance2)
-    for k in range(asked):
-        frame.hits[rows[k]] = found[k]
-
-
-@kernel
-def weigh(T, frame, weight, planes, rules, local, tally):
-    """
-    Write one frame's normal equations at T_map_body; count its usable and fitting zones.
-
-    Returns the robust cost, the sum of weighted squared residuals and the number of matched zones.
-    An unmatched zone costs what a residual at the gate would, so that losing matches never pays.
-    """
-    H, g, row, variance = local.H, local.g, np.empty(6), frame.variance
-    H[:, :] = 0.0
-    g[:] = 0.0
-    cost, squared, count = 0.0, 0.0, 0
-    c2, gate2 = rules.cauchy * rules.cauchy, rules.gate * rules.gate
-    for z in range(variance.shape[0]):
-        if not np.isfinite(variance[z]):
-            continue
-        tally[0] += 1.0
-        hit = frame.hits[z]
-        if hit < 0:
-            cost += 0.5 * weight * c2 * np.log1p(gate2 / (c2 * (variance[z] + rules.floor2)))
-            continue
-        r = _residual(T, frame.q, z, planes.rows, hit, row)
-        total = _spread(frame, z, row, rules) + planes.variance
-        u2 = r * r / total
-        robust = 1.0 / (1.0 + u2 / c2)
-        alpha = weight * planes.rows[hit, 6]
-        information = alpha * robust / total
-        for i in range(6):
-            scaled = information * row[i]
-            g[i] += scaled * r
-            for j in range(i + 1):
-                H[i, j] += scaled * row[j]
-        cost += 0.5 * alpha * c2 * np.log1p(u2 / c2)
-        squared += u2 * robust
-        count += 1
-        if u2 < FIT_SIGMAS * FIT_SIGMAS:
-            tally[1] += 1.0
-    for i in range(6):
-        for j in range(i):
-            H[j, i] = H[i, j]
-    return cost, squared, count
-
-
-@kernel(inline='always')
-def _residual(T, q, z, planes, hit, row):
-    """Distance of zone z from the plane that it hit, and its derivative by the pose, row (6,)."""
-    a, b, c = q[z, 0], q[z, 1], q[z, 2]
-    x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-    y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-    w = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-    nx, ny, nz = planes[hit, 3], planes[hit, 4], planes[hit, 5]
-    row[0] = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
-    row[1] = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
-    row[2] = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
-    row[3] = b * row[2] - c * row[1]
-    row[4] = c * row[0] - a * row[2]
-    row[5] = a * row[1] - b * row[0]
-    return nx * (x - planes[hit, 0]) + ny * (y - planes[hit, 1]) + nz * (w - planes[hit, 2])
-
-
-@kernel(inline='always')
-def _spread(frame, z, row, rules):
-    """Variance of zone z across a surface whose normal in the node's frame is row[:3]."""
-    rays, q = frame.rays, frame.q
-    cosine = row[0] * rays[z, 0] + row[1] * rays[z, 1] + row[2] * rays[z, 2]
-    cosine2 = cosine * cosine
-    width = rules.footprint * np.sqrt(q[z, 0] * q[z, 0] + q[z, 1] * q[z, 1] + q[z, 2] * q[z, 2])
-    return frame.variance[z] * cosine2 + width * width * (1.0 - cosine2) + rules.floor2
