@@ -65,7 +65,7 @@ setup(
         # Where there is no ROS 2 installation, the same Jazzy packages as wheels.
         'ros': ['ros-jazzy-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
         'test': ['pytest', 'pytest-timeout', 'hypothesis', 'evo', 'ruff'],
-        'bench': ['gtsam', 'kiss-icp', 'mcap-ros2-support', 'small_gicp'],
+        'bench': ['gtsam', 'mcap-ros2-support', 'small_gicp'],
         'cluster': ['dask', 'distributed'],
     },
     zip_safe=False,

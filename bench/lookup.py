@@ -1,317 +1,171 @@
 """
-Nearest-neighbour lookup in a map of 500,000 points, beside SciPy, Open3D, KISS-ICP and small_gicp.
+What the filter asks of the map's index, beside what one would ask a tree instead.
 
-`run(quick)` gives a list of rows, each ours against one peer on one workload; `scaling(quick)` the
-cost of a lookup against the size of the map. The process is pinned to one core while it measures,
-so that everybody has one thread.
+`run(quick)` gives rows of what the filter calls (`nearest_facing_batch`): the nearest map point
+to the end of a beam among those that face it. It is asked for the places where the filter asks:
+every zone that the engine robot in S0 measures along t2, at the estimated poses, some thousand
+(an instant's 16 sensors of 64 zones) at a time, in the map of that trial. The process is pinned
+to one core while it measures, so that everybody has one thread.
 
-Workloads, on the engine scene (thin blades):
-- *filter*: frames of 16 sensors x 64 zones that drift by 3 mm a frame with 5 mm of noise, looked
-  up three times with a slightly corrected pose, as the iterations of the filter do;
-- *scattered*: single places all over the map, 1 to 10 cm from it;
-- *facing the beam*: the filter's frames where its beams have been before; *new beams*: for an
-  index that has seen none of them;
-- *map*: what is made of a map before the first lookup.
-
-KISS-ICP does not offer its lookup alone: its row is one iteration of its registration, which adds
-the 6x6 sums of each pair. Its voxel map looks no further than the 27 voxels around, so that it is
-exact only near the surface.
+- *facing the beam*: no peer offers it. Theirs is what one would do with a tree: take NEIGHBOURS
+  and of them the first that faces the beam; the row says how often that is the right one.
+- *facing, their any point*: beside a peer's plain nearest point, which is an easier question.
+- *index of the map*: what is made once for all users of a map in a process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import time
 
-from bench.harness import one_core, paired, side_by_side
-from continuum_loc.mapping.build import sample_mesh
-from continuum_loc.mapping.facing import PATIENCE
+from bench.harness import one_core, side_by_side
+from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.mapping.prior_map import PriorMap
+from continuum_loc.mapping.voxel_index import VoxelIndex
+from continuum_loc.measurements import TofFrame
+from continuum_loc.offline.replay import replay
+from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.robot import load_robot
+from continuum_loc.scene.anomalies import Beams
+from continuum_loc.scene.reconstruct import reconstruct
 import numpy as np
 
-BOUNDS = [
-    (f'lookup, {workload}', 'ratio', 'at least', 3.0)
-    for workload in ('filter', 'scattered', 'facing')
-]
-MAX_DISTANCE, MIN_COS = 0.1, 0.1
+BOUNDS = [('lookup, facing the beam', 'ratio', 'at least', 3.0)]
 NEIGHBOURS = 16  # that a peer is asked for where the nearest may not face the beam
-MAP_POINTS = 500_000
-Query = Callable[[np.ndarray], object]
+BATCH = 1024  # beams at a time
+Neighbours = Callable[[np.ndarray, int], np.ndarray]
+Batch = tuple[np.ndarray, np.ndarray]  # ends (Q, 3) and directions (Q, 3) of beams
 
 
 def run(quick: bool = False) -> list[dict]:
     """
     Rows of name, ours_s, peer, peer_s, ratio (peer / ours) and spread (its quartiles).
 
-    Times are seconds per lookup.
+    Times are seconds per lookup, or to make an index.
     """
-    prior = _engine_map(MAP_POINTS // (10 if quick else 1))
-    repeats = 5 if quick else 15
-    index = prior.index(reach=MAX_DISTANCE).prepare()
-    frames, scattered = _filter_frames(prior, 5 if quick else 20), [_scattered(prior)]
-    peers = dict(_peers(prior))
+    prior, repeats = scene_map('S0'), 5 if quick else 15
+    batches = _asked(prior, 1.0 if quick else 8.0)
+    tof = load_estimator_settings('engine').tof
+
+    def ours(batch: Batch) -> np.ndarray:
+        return prior.index.nearest_facing(*batch, tof.gate, tof.min_cosine)[0]
+
     with one_core():
-        rows = [
-            _compare(name, lambda q: index.nearest(q, MAX_DISTANCE), peer, query, batches, repeats)
-            for name, batches in (('lookup, filter', frames), ('lookup, scattered', scattered))
-            for peer, query in peers.items()
+        peers = list(_peers(prior))
+        return [
+            *(_facing(prior, ours, *peer, batches, repeats) for peer in peers),
+            *(_any_point(ours, *peer, batches, repeats) for peer in peers),
+            _made(prior, repeats),
         ]
-        fastest = min(
-            (row for row in rows if row['name'] == 'lookup, filter'), key=lambda row: row['peer_s']
-        )['peer']
-        rows += _compare_facing(prior, index, fastest, peers[fastest], frames, repeats)
-        rows += _compare_made(prior, repeats // 5)
-    return rows
 
 
-def scaling(quick: bool = False) -> list[dict]:
-    """
-    Rows of points, build_s, lookup_s, index_bytes, lists and groups (in a list, on average).
-
-    Times are seconds, of a lookup in filter frames.
-    """
-    rows = []
-    for count in (5_000, 50_000, 500_000) if quick else (5_000, 50_000, 500_000, 5_000_000):
-        prior = _random_map(count)
-        frames = _filter_frames(prior, 10)
-        started = time.perf_counter()
-        index = prior.index(reach=MAX_DISTANCE).prepare()
-        built = time.perf_counter() - started
-        with one_core():
-            lookup = min(
-                _ask(lambda q, index=index: index.nearest(q, MAX_DISTANCE), frames)
-                for _ in range(5)
-            )
-        size = sum(
-            array.nbytes for array in (*index.arrays, *index.near) if isinstance(array, np.ndarray)
-        )
-        lists = np.count_nonzero(np.diff(index.near.begins))
-        rows.append(
-            {
-                'points': count,
-                'build_s': built,
-                'lookup_s': lookup,
-                'index_bytes': size,
-                'lists': lists,
-                'groups': len(index.near.groups) / lists,
-            }
-        )
-    return rows
+def _asked(prior: PriorMap, duration: float) -> list[Batch]:
+    """List the beams of a run of the filter in the order of their frames."""
+    robot = load_robot('engine')
+    samples = measured(Trial('engine', 'S0', 't2', duration=duration))
+    track = replay(samples, make_filter(robot, prior)).track
+    frames = [sample for sample in samples if isinstance(sample, TofFrame)]
+    placed = reconstruct(robot, frames, track)
+    directions = Beams.of(placed).directions[: len(placed.points)]
+    return [
+        (placed.points[first : first + BATCH], directions[first : first + BATCH])
+        for first in range(0, len(directions), BATCH)
+    ]
 
 
-def _engine_mesh() -> tuple[np.ndarray, np.ndarray]:
-    from continuum_loc.simulator.scenes import load_scene
-
-    scene = load_scene('S0')
-    return scene.vertices, scene.faces
-
-
-def _engine_map(count: int) -> PriorMap:
-    return sample_mesh(*_engine_mesh(), count=count, seed=0)
-
-
-def _random_map(count: int) -> PriorMap:
-    """
-    As many random points on the engine.
-
-    Much faster to make than blue noise, and the index does not care.
-    """
-    import trimesh
-
-    mesh = trimesh.Trimesh(*_engine_mesh(), process=False)
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    return PriorMap(
-        points, mesh.face_normals[faces], np.ones(count), spacing=float(np.sqrt(mesh.area / count))
-    )
-
-
-def _filter_frames(prior: PriorMap, frames: int, iterations: int = 3) -> list[np.ndarray]:
-    """`frames * iterations` batches (1024, 3) of zones of 16 sensors."""
-    zones, rng = _filter_zones(prior)
-    drift = np.repeat(0.003 * _unit(rng.normal(size=(16, 3))), 64, axis=0)
-    batches = []
-    for frame in range(frames):
-        measured = zones + frame * drift + rng.normal(0.0, 0.005, zones.shape)
-        for iteration in range(iterations):
-            pose_error = np.repeat(rng.normal(0.0, 0.01 / 4**iteration, (16, 3)), 64, axis=0)
-            batches.append(measured + pose_error)
-    return batches
-
-
-def _filter_zones(prior: PriorMap) -> tuple[np.ndarray, np.random.Generator]:
-    """
-    (1024, 3) places where the zones of 16 sensors hit the map at first.
-
-    Each sensor sees a patch of 0.25 m radius.
-    """
-    from scipy.spatial import cKDTree
-
-    rng = np.random.default_rng(0)
-    tree = cKDTree(prior.points)
-    anchors = rng.integers(0, len(prior), 16)
-    seen = [rng.choice(tree.query_ball_point(prior.points[a], 0.25), 64) for a in anchors]
-    return prior.points[np.concatenate(seen)], rng
-
-
-def _scattered(prior: PriorMap, count: int = 20_000) -> np.ndarray:
-    rng = np.random.default_rng(1)
-    rows = rng.integers(0, len(prior), count)
-    return prior.points[rows] + rng.uniform(0.01, 0.1, (count, 1)) * _unit(
-        rng.normal(size=(count, 3))
-    )
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def _peers(prior: PriorMap) -> Iterator[tuple[str, Query]]:
-    """Every peer that is installed, by name, as a function of a batch of queries."""
+def _peers(prior: PriorMap) -> Iterator[tuple[str, Neighbours]]:
+    """Every peer that is installed, by name, as a function to rows (Q, k) of the k nearest."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(prior.points)
-    yield 'SciPy cKDTree', lambda q: tree.query(q, distance_upper_bound=MAX_DISTANCE, workers=1)
-    for optional in (_open3d_peers, _small_gicp_peer, _kiss_icp_peer):
+    yield 'SciPy cKDTree', lambda q, k: tree.query(q, np.arange(1, k + 1), workers=1)[1]
+    for optional in (_open3d_peer, _small_gicp_peer):
         try:
-            yield from optional(prior)
+            yield optional(prior)
         except ImportError:
             continue
 
 
-def _open3d_peers(prior: PriorMap) -> Iterator[tuple[str, Query]]:
+def _open3d_peer(prior: PriorMap) -> tuple[str, Neighbours]:
     import open3d
 
     search = open3d.core.nns.NearestNeighborSearch(open3d.core.Tensor(prior.points))
     search.knn_index()
-    yield 'Open3D NearestNeighborSearch', lambda q: search.knn_search(open3d.core.Tensor(q), 1)
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(prior.points))
-    tree = open3d.geometry.KDTreeFlann(cloud)
-    yield 'Open3D KDTreeFlann', lambda q: [tree.search_knn_vector_3d(place, 1) for place in q]
+    return (
+        'Open3D NearestNeighborSearch',
+        lambda q, k: search.knn_search(open3d.core.Tensor(q), k)[0].numpy(),
+    )
 
 
-def _small_gicp_peer(prior: PriorMap) -> Iterator[tuple[str, Query]]:
+def _small_gicp_peer(prior: PriorMap) -> tuple[str, Neighbours]:
     import small_gicp
 
     tree = small_gicp.KdTree(prior.points)
-    yield 'small_gicp KdTree', lambda q: tree.batch_knn_search(q, 1, num_threads=1)
+    return (
+        'small_gicp KdTree',
+        lambda q, k: np.asarray(tree.batch_knn_search(q, k, num_threads=1)[0]),
+    )
 
 
-def _kiss_icp_peer(prior: PriorMap, voxel: float = 0.03) -> Iterator[tuple[str, Query]]:
-    from kiss_icp.pybind import kiss_icp_pybind
+def _facing(prior, ours, peer, neighbours, batches, repeats) -> dict:
+    tof = load_estimator_settings('engine').tof
 
-    voxel_map = kiss_icp_pybind._VoxelHashMap(voxel, 1e3, 400)
-    voxel_map._add_points(kiss_icp_pybind._Vector3dVector(prior.points))
-    registration = kiss_icp_pybind._Registration(1, 1e-12, 1)
+    def first_that_faces(batch: Batch) -> np.ndarray:
+        ends, directions = batch
+        rows = neighbours(ends, NEIGHBOURS)
+        cosine = -np.einsum('qi,qki->qk', directions, prior.normals[rows])
+        faces = cosine >= tof.min_cosine
+        found = rows[np.arange(len(rows)), faces.argmax(axis=1)]
+        near = np.sum((prior.points[found] - ends) ** 2, axis=1) < tof.gate**2
+        return np.where(faces.any(axis=1) & near, found, -1)
 
-    def query(q: np.ndarray) -> np.ndarray:
-        points = kiss_icp_pybind._Vector3dVector(q)
-        return registration._align_points_to_map(points, voxel_map, np.eye(4), MAX_DISTANCE, 0.01)
+    right = np.concatenate([first_that_faces(batch) == ours(batch) for batch in batches])
+    return _compare(
+        'lookup, facing the beam',
+        ours,
+        f'{peer}, first of {NEIGHBOURS} (right for {np.mean(right):.1%})',
+        first_that_faces,
+        batches,
+        repeats,
+    )
 
-    yield 'KISS-ICP registration step', query
 
-
-def _ask(query: Query, batches: list[np.ndarray]) -> float:
-    """
-    Seconds of processor time per lookup.
-
-    On one core that is what one waits for, without what others do to it.
-    """
-    started = time.process_time()
-    for batch in batches:
-        query(batch)
-    return (time.process_time() - started) / sum(map(len, batches))
+def _any_point(ours, peer, neighbours, batches, repeats) -> dict:
+    return _compare(
+        'lookup, facing, their any point',
+        ours,
+        f'{peer}, any point',
+        lambda batch: neighbours(batch[0], 1),
+        batches,
+        repeats,
+    )
 
 
 def _compare(
-    name: str, ours: Query, peer: str, query: Query, batches: list[np.ndarray], repeats: int
+    name: str, ours: Callable, peer: str, theirs: Callable, batches: list[Batch], repeats: int
 ) -> dict:
     return side_by_side(
         name,
         lambda: [ours(batch) for batch in batches],
         peer,
-        lambda: [query(batch) for batch in batches],
+        lambda: [theirs(batch) for batch in batches],
         repeats,
-        per_call=sum(map(len, batches)),
+        per_call=sum(len(ends) for ends, _ in batches),
     )
 
 
-def _compare_made(prior: PriorMap, repeats: int) -> Iterator[dict]:
-    """Compare what making an index takes, and what making the lists of `nearest` adds."""
+def _made(prior: PriorMap, repeats: int) -> dict:
     from scipy.spatial import cKDTree
 
-    for name, ours in (
-        ('map, for beams', lambda: prior.index(reach=MAX_DISTANCE)),
-        ('map, for any point', lambda: prior.index(reach=MAX_DISTANCE).prepare()),
-    ):
-        yield side_by_side(
-            f'lookup, {name}', ours, 'SciPy cKDTree', lambda: cKDTree(prior.points), repeats
-        )
-
-
-def _compare_facing(prior, index, peer, query, batches, repeats) -> list[dict]:
-    """
-    Compare the nearest surface that faces the beam, which no peer can be asked for.
-
-    Once beside the nearest point of all, which is less work, and once beside what a user would do:
-    ask for NEIGHBOURS at once and take the first that faces, where there is one.
-    """
-    rng = np.random.default_rng(2)
-    rows, _ = index.nearest(_filter_zones(prior)[0], MAX_DISTANCE)
-    beams = _unit(-prior.normals[rows] + 0.3 * rng.normal(size=(len(rows), 3)))
-    ours: Query = lambda q: index.nearest_facing(q, beams, MAX_DISTANCE, MIN_COS)  # noqa: E731
-    any_point = f'{peer}, any point'
-    new = _compare_new_beams(index, beams, any_point, query, batches, repeats)
-    for _ in range(PATIENCE):
-        _ask(ours, batches)
-    name, (other, first_of) = (
-        'lookup, facing the beam',
-        _first_that_faces(prior, beams, ours, batches),
+    return side_by_side(
+        'lookup, index of the map',
+        lambda: VoxelIndex(prior.points, prior.normals),
+        'SciPy cKDTree',
+        lambda: cKDTree(prior.points),
+        repeats,
+        memory_bytes=prior.index.memory_bytes,
     )
-    return [
-        _compare(name, ours, any_point, query, batches, repeats),
-        _compare(name, ours, other, first_of, batches, repeats),
-        new,
-    ]
-
-
-def _compare_new_beams(index, beams, peer, query, batches, repeats) -> dict:
-    """Every repeat begins with an empty cache, as a filter does that has just been started."""
-    pairs = []
-    for _ in range(repeats):
-        fresh = index.copy()
-        ours = _ask(
-            lambda q, fresh=fresh: fresh.nearest_facing(q, beams, MAX_DISTANCE, MIN_COS), batches
-        )
-        pairs.append((ours, _ask(query, batches)))
-    return paired('lookup, new beams', peer, np.array(pairs))
-
-
-def _first_that_faces(prior: PriorMap, beams: np.ndarray, ours: Query, batches: list[np.ndarray]):
-    """Ask a tree for several neighbours: its name and share of our answers, and the query."""
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(prior.points)
-
-    def query(q: np.ndarray) -> np.ndarray:
-        _, rows = tree.query(q, NEIGHBOURS, workers=1)
-        faces = -np.einsum('qi,qki->qk', beams, prior.normals[rows]) >= MIN_COS
-        return np.where(faces.any(axis=1), rows[np.arange(len(q)), faces.argmax(axis=1)], -1)
-
-    share = np.mean([np.mean(query(batch) == ours(batch)[0]) for batch in batches[:3]])
-    return f'SciPy cKDTree, first of {NEIGHBOURS} (finds {share:.0%})', query
 
 
 if __name__ == '__main__':
     for row in run():
-        print(
-            f'{row["name"]:24s} {row["ours_s"] * 1e9:7.0f} ns   {row["peer"]:28s} '
-            f'{row["peer_s"] * 1e9:8.0f} ns   {row["ratio"]:6.1f} x  ({row["spread"][0]:.1f} to '
-            f'{row["spread"][1]:.1f})'
-        )
-    for row in scaling():
-        print(
-            f'{row["points"]:9d} points: built in {row["build_s"]:.2f} s, '
-            f'{row["index_bytes"] / 1e6:.0f} MB, '
-            f'{row["lists"]} lists of {row["groups"]:.1f} groups, '
-            f'lookup {row["lookup_s"] * 1e9:.0f} ns'
-        )
+        print(row)

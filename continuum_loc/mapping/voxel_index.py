@@ -49,6 +49,11 @@ class VoxelIndex:
             )
         self.arrays = _sorted_by_block(points, normals, edge)
 
+    @property
+    def memory_bytes(self) -> int:
+        """Size of all arrays."""
+        return sum(array.nbytes for array in self.arrays if isinstance(array, np.ndarray))
+
     def nearest(
         self, queries: np.ndarray, max_distance: float = np.inf
     ) -> tuple[np.ndarray, np.ndarray]:

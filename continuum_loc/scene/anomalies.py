@@ -29,7 +29,6 @@ from typing import get_args, Literal, NamedTuple
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.build import DENSITY
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.scene.free_space import passes
 from continuum_loc.scene.reconstruct import distances_to_mesh, Reconstruction
 from continuum_loc.scene.splat_cast import first_crossings
@@ -200,24 +199,18 @@ def detect_anomalies(
     reconstruction: Reconstruction,
     prior: PriorMap,
     settings: AnomalySettings | None = None,
-    index: VoxelIndex | None = None,
 ) -> list[AnomalyCluster]:
-    """
-    All differences of both kinds, most confident first.
-
-    `index`: of `prior`, if there is one already.
-    """
+    """All differences of both kinds, most confident first."""
     settings = settings or AnomalySettings()
-    index = index or prior.index
     beams = Beams.of(reconstruction)
-    missing = clusters(missing_evidence(beams, prior, settings, index), 'missing', settings)
-    behind = behind_map(beams, prior, index, len(reconstruction.points))
-    new = new_evidence(reconstruction, prior, settings, index, behind)
+    missing = clusters(missing_evidence(beams, prior, settings), 'missing', settings)
+    behind = behind_map(beams, prior, len(reconstruction.points))
+    new = new_evidence(reconstruction, prior, settings, behind)
     added = clusters(new, 'added', settings, beams)
     found = [
         cluster
         for cluster in added + missing
-        if unexplained_share(cluster, beams, prior, settings, index) >= settings.min_unexplained
+        if unexplained_share(cluster, beams, prior, settings) >= settings.min_unexplained
     ]
     return sorted(found, key=lambda cluster: -cluster.confidence)
 
@@ -227,7 +220,6 @@ def unexplained_share(
     beams: Beams,
     prior: PriorMap,
     settings: AnomalySettings,
-    index: VoxelIndex,
 ) -> float:
     """
     Share of a cluster's witnesses that differ from all that the map shows round their line.
@@ -238,13 +230,13 @@ def unexplained_share(
     own = beams.of_rows(cluster.witnesses)
     added, margin = cluster.kind == 'added', own.margin(prior, settings)
     width = prior.spacing * (settings.added_width if added else settings.missing_width)
-    nearest, farthest = depths_around(prior, index, own, own.lengths + margin, width)
+    nearest, farthest = depths_around(prior, own, own.lengths + margin, width)
     differs = own.lengths < nearest - margin if added else own.lengths > farthest + margin
     return float(np.mean(differs))
 
 
 def depths_around(
-    prior: PriorMap, index: VoxelIndex, beams: Beams, reach: np.ndarray, width: float
+    prior: PriorMap, beams: Beams, reach: np.ndarray, width: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     (B,) nearest and (B,) farthest depth [m] at which the map is crossed on and round each beam.
@@ -260,7 +252,7 @@ def depths_around(
     aside = [np.cos(turn) * across + np.sin(turn) * upward for turn in turns]
     depths = np.stack(
         [
-            first_crossings(prior, index, beams.origins + offset, beams.directions, reach)[1]
+            first_crossings(prior, beams.origins + offset, beams.directions, reach)[1]
             for offset in (np.zeros(3), *aside)
         ]
     )
@@ -271,7 +263,6 @@ def new_evidence(
     reconstruction: Reconstruction,
     prior: PriorMap,
     settings: AnomalySettings,
-    index: VoxelIndex,
     behind: np.ndarray | None = None,
 ) -> Evidence:
     """
@@ -280,7 +271,7 @@ def new_evidence(
     What lies `behind` the map (N,), on the beam, is no new thing: the range erred, or something
     missing has laid it open.
     """
-    distance2, offset = mahalanobis2(reconstruction, prior, settings.search_radius, index)
+    distance2, offset = mahalanobis2(reconstruction, prior, settings.search_radius)
     disagrees = (distance2 > settings.tau) & (offset > settings.min_distance)
     if behind is not None:
         disagrees &= ~behind
@@ -290,10 +281,10 @@ def new_evidence(
 
 
 def mahalanobis2(
-    reconstruction: Reconstruction, prior: PriorMap, search_radius: float, index: VoxelIndex
+    reconstruction: Reconstruction, prior: PriorMap, search_radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) left side of eq. 12 and (N,) distance [m] to the nearest map point; inf where none."""
-    row, distance = index.nearest(reconstruction.points, search_radius)
+    row, distance = prior.index.nearest(reconstruction.points, search_radius)
     distance2 = np.full(len(row), np.inf)
     found = np.flatnonzero(row >= 0)
     normal = prior.normals[row[found]]
@@ -312,9 +303,7 @@ def tangential_variance(prior: PriorMap) -> float:
     return prior.spacing**2 / DENSITY / (4.0 * np.pi)
 
 
-def missing_evidence(
-    beams: Beams, prior: PriorMap, settings: AnomalySettings, index: VoxelIndex
-) -> Evidence:
+def missing_evidence(beams: Beams, prior: PriorMap, settings: AnomalySettings) -> Evidence:
     """
     Judge every mapped surface that a beam should have met first: did the beam go through it.
 
@@ -324,7 +313,6 @@ def missing_evidence(
     margin = beams.margin(prior, settings)
     row, depth = first_crossings(
         prior,
-        index,
         beams.origins,
         beams.directions,
         beams.lengths + margin,
@@ -334,7 +322,7 @@ def missing_evidence(
     return Evidence(prior.points[row[met]], through[met], beams.stamps[met], met)
 
 
-def behind_map(beams: Beams, prior: PriorMap, index: VoxelIndex, count: int) -> np.ndarray:
+def behind_map(beams: Beams, prior: PriorMap, count: int) -> np.ndarray:
     """
     Whether the map lies before the end of each of the first `count` beams.
 
@@ -342,7 +330,7 @@ def behind_map(beams: Beams, prior: PriorMap, index: VoxelIndex, count: int) -> 
     """
     first = slice(None, count)
     row, depth = first_crossings(
-        prior, index, beams.origins[first], beams.directions[first], beams.lengths[first]
+        prior, beams.origins[first], beams.directions[first], beams.lengths[first]
     )
     return (row >= 0) & (depth < beams.lengths[first])
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from continuum_loc.compiling import kernel
 from continuum_loc.mapping.grid import find
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import VoxelIndex
 import numpy as np
 
 COVER = 1.25  # spacings: 99.9 % of a sampled surface lies nearer than this to a sample
@@ -32,7 +31,6 @@ class Discs(NamedTuple):
 
 def first_crossings(
     prior: PriorMap,
-    index: VoxelIndex,
     origins: np.ndarray,
     directions: np.ndarray,
     lengths: np.ndarray,
@@ -54,7 +52,7 @@ def first_crossings(
         np.ascontiguousarray(part, dtype=np.float64) for part in (origins, directions, lengths)
     )
     discs = Discs(float(radius), float(min_cos), bool(prior.oriented))
-    _cast(index.arrays, discs, *rays, rows, depths)
+    _cast(prior.index.arrays, discs, *rays, rows, depths)
     return rows, depths
 
 

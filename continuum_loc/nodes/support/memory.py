@@ -108,7 +108,7 @@ class SeenScene:
         points = reconstruct(self._robot, frames, trajectory)
         if self._prior is None:
             return points, np.full(len(points.points), np.nan)
-        squared, _ = mahalanobis2(points, self._prior, self._search_radius, self._prior.index)
+        squared, _ = mahalanobis2(points, self._prior, self._search_radius)
         return points, np.sqrt(squared)
 
     def clear(self) -> None:
