@@ -12,7 +12,7 @@ from typing import Any
 
 from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID
 from continuum_loc.robot import load_robot, TofModel
-from continuum_loc.simulator.tof import Echoes
+from continuum_loc.simulator.echoes import Echoes
 from continuum_loc.simulator.vl53l5cx import (
     STATUS_BLURRED,
     STATUS_INCONSISTENT,

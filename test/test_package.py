@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tokenize
+import tomllib
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -127,8 +128,6 @@ def test_package_xml_is_what_colcon_takes_for_ament_python():
 
 
 def test_pyproject_leaves_the_metadata_to_setup_py():
-    import tomllib
-
     assert 'project' not in tomllib.loads((ROOT / 'pyproject.toml').read_text())
 
 
@@ -150,6 +149,31 @@ def test_the_style_is_that_of_ros(command):
         text=True,
     )
     assert done.returncode == 0, done.stdout
+
+
+def test_arrows_run_downward_and_there_are_no_circles():
+    """As the contracts of import-linter in pyproject.toml have it."""
+    done = subprocess.run(
+        [Path(sys.executable).with_name('lint-imports'), '--no-cache'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+    assert '2 kept' in done.stdout
+
+
+def test_every_room_has_its_floor():
+    layers = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['importlinter'][
+        'contracts'
+    ][0]['layers']
+    named = {name.strip() for layer in layers for name in re.split('[|:]', layer)}
+    rooms = {
+        f'continuum_loc.{path.stem}'
+        for path in (ROOT / 'continuum_loc').iterdir()
+        if (path.suffix == '.py' and path.stem != '__init__') or (path / '__init__.py').is_file()
+    }
+    assert named == rooms | {'msg_tools', 'studies', 'bench'}
 
 
 def test_no_slice_has_a_space_before_its_colon():

@@ -23,7 +23,7 @@ from continuum_loc.compiling import kernel
 from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID
 from continuum_loc.robot import TofModel
 from continuum_loc.settings import Settings
-from continuum_loc.simulator.tof import Echoes, Readings, TOF_TOO_CLOSE
+from continuum_loc.simulator.echoes import Echoes, Readings, TOF_TOO_CLOSE
 import numpy as np
 from pydantic import Field
 
