@@ -31,6 +31,7 @@ SHOWN = {
 }
 NEW = 'new'  # what the map does not show
 PAGE = Path(__file__).parent / 'viewer.html'
+SCRIPT = PAGE.with_suffix('.js')
 NOTHING = {'x': [], 'y': [], 'z': []}
 
 
@@ -100,11 +101,9 @@ class ViewerNode(PackageNode):
         )
 
     def _serve(self) -> ThreadingHTTPServer:
-        from plotly.offline import get_plotlyjs
-
         answers = {
             '/': ('text/html', PAGE.read_bytes),
-            '/plotly.js': ('text/javascript', get_plotlyjs().encode),
+            '/viewer.js': ('text/javascript', SCRIPT.read_bytes),
             '/state.json': ('application/json', lambda: json.dumps(self.state()).encode()),
             '/map.json': ('application/json', lambda: json.dumps(self.newest['map']).encode()),
         }
