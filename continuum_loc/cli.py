@@ -14,7 +14,8 @@ from pathlib import Path
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
-from continuum_loc.errors import ContinuumLocError, InputError, StudyError
+from continuum_loc.errors import ContinuumLocError, InputError, NotInstalled, StudyError
+from continuum_loc.extras import explained
 from rich.console import Console
 from rich.markup import escape
 import typer
@@ -66,8 +67,18 @@ def main() -> None:
     try:
         app()
     except ContinuumLocError as error:
-        errors.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False, soft_wrap=True)
-        sys.exit(USAGE if isinstance(error, InputError) else FAILED)
+        _tell(error)
+    except ModuleNotFoundError as error:
+        told = explained(error)
+        if told is error:
+            raise
+        _tell(told)
+
+
+def _tell(error: ContinuumLocError) -> None:
+    """Say what went wrong in one line, and end."""
+    errors.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False, soft_wrap=True)
+    sys.exit(USAGE if isinstance(error, InputError) else FAILED)
 
 
 @app.command()
@@ -230,9 +241,8 @@ def replay(
             'estimator': estimator.settings,
         },
     )
-    _write_report(folder)
     console.print(_run_table(summary))
-    console.print(f'report  {folder}/report.html')
+    _report_where_it_can(folder)
 
 
 @app.command()
@@ -269,9 +279,8 @@ def shape(
         seed=None,
         configuration={'robot': description, 'bag': bag, 'estimator': estimator.settings},
     )
-    _write_report(folder)
     console.print(_run_table(summary))
-    console.print(f'report  {folder}/report.html')
+    _report_where_it_can(folder)
 
 
 @app.command()
@@ -606,6 +615,18 @@ def _write_report(folder: Path) -> Path:
         status.update('writing the report')
         run = load_run(folder)
         return write_report(run, context_of(run))
+
+
+def _report_where_it_can(folder: Path) -> None:
+    """Write the report after a run, which stands without it where its libraries are missing."""
+    try:
+        _write_report(folder)
+    except NotInstalled as error:
+        console.print(f'run     {folder}')
+        said = f'[yellow]no report:[/] {escape(str(error))}'
+        errors.print(said, highlight=False, soft_wrap=True)
+    else:
+        console.print(f'report  {folder}/report.html')
 
 
 def _run_table(summary: dict[str, Any]) -> Any:

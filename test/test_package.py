@@ -12,6 +12,8 @@ import tokenize
 import tomllib
 import xml.etree.ElementTree as ElementTree
 
+from continuum_loc.closure import imports_of
+from continuum_loc.extras import EXTRAS, WHAT
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -125,6 +127,91 @@ def test_package_xml_is_what_colcon_takes_for_ament_python():
     version = re.search(r'version=.([\d.]+).', (ROOT / 'setup.py').read_text())[1]
     assert package.findtext('version') == version
     assert (ROOT / 'resource' / 'continuum_loc').is_file()
+
+
+def _imported(*packages):
+    """Names of the modules of others that our packages import, wherever in them."""
+    own = {'continuum_loc', 'msg_tools', 'studies', 'bench'}
+    found = {
+        imported.module.partition('.')[0]
+        for package in packages
+        for path in (ROOT / package).rglob('*.py')
+        for imported in imports_of(path, '.'.join(path.relative_to(ROOT).with_suffix('').parts))
+    }
+    return found - set(sys.stdlib_module_names) - own
+
+
+def _setup():
+    """List the distributions that are required, by extra ('' for the base)."""
+    call = next(
+        node
+        for node in ast.walk(ast.parse((ROOT / 'setup.py').read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == 'setup'
+    )
+    given = {
+        keyword.arg: ast.literal_eval(keyword.value)
+        for keyword in call.keywords
+        if keyword.arg in ('install_requires', 'extras_require')
+    }
+    lines = {'': given['install_requires'], **given['extras_require']}
+    return {extra: {re.split(r'[<>=\[]', one)[0] for one in all_} for extra, all_ in lines.items()}
+
+
+MODULES = {'pyyaml': 'yaml', 'pillow': 'PIL', 'ros-jazzy-rclpy': 'rclpy'}
+NO_MODULE = {'ros-common-interfaces', 'dask', 'continuum_loc'}  # messages; part of distributed; us
+
+
+def test_setup_py_names_all_that_the_package_imports_and_nothing_else():
+    setup = _setup()
+    modules = {
+        extra: {MODULES.get(one, one) for one in names - NO_MODULE}
+        for extra, names in setup.items()
+        if extra not in ('test', 'bench', 'all')
+    }
+    named = set().union(*modules.values())
+    imported = _imported('continuum_loc', 'msg_tools')
+    assert imported - set(ROS) <= named
+    assert named - imported == {'matplotlib', 'psutil'}  # of the studies alone
+    assert _imported('studies') <= named | {'numpy'}
+    assert modules[''] <= imported
+
+
+def test_what_is_told_to_be_installed_is_what_setup_py_has():
+    setup = _setup()
+    assert set(EXTRAS) == set(WHAT) == set(setup) - {'', 'all', 'test', 'bench'}
+    for extra, modules in EXTRAS.items():
+        named = {MODULES.get(one, one) for one in setup[extra] - NO_MODULE - setup['']}
+        assert set(modules) == named, extra
+        assert not set(modules) & setup['']
+
+
+KEYS = {
+    'python3-numba': {'numba', 'llvmlite'},
+    'python3-pil': {'PIL'},
+    'ros2launch': {'launch', 'launch_ros'},
+}
+
+
+def test_package_xml_names_all_that_the_package_imports():
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    named = {one.text: one.get('condition') for one in package.findall('exec_depend')}
+    modules = {key: KEYS.get(key, {re.sub('^python3-|-pip$', '', key)}) for key in named}
+    by_pip = {one.text: one.get('extra', '') for one in package.findall('export/pip')}
+    everything = set().union(*modules.values(), by_pip)
+    messages = {
+        match
+        for folder in ('continuum_loc', 'msg_tools')
+        for path in (ROOT / folder).rglob('*.py')
+        for match in re.findall(r"'(\w+)/(?:msg|srv)/", path.read_text())
+    }
+    imported = _imported('continuum_loc', 'msg_tools', 'launch', 'studies')
+    assert imported | messages == everything
+    # What the base does not need is not installed without being asked for.
+    base = {MODULES.get(one, one) for one in _setup()['']} | set(ROS)
+    for key, condition in named.items():
+        assert (condition is None) == (modules[key] <= base), key
+    for module, extra in by_pip.items():
+        assert module in _setup()[extra]
 
 
 def test_pyproject_leaves_the_metadata_to_setup_py():

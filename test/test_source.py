@@ -307,9 +307,11 @@ def test_another_version_of_a_library_is_other_code(tmp_path, monkeypatch):
 
 def test_an_import_of_several_names_is_several(tmp_path):
     path = tmp_path / 'a.py'
-    path.write_text('import x.y, z\nfrom . import b, c\nfrom ..d import e as f\n')
+    path.write_text(
+        'import x.y, z\nfrom . import b, c\nfrom ..d import e as f\ng = require("h.i", "maps")\n'
+    )
     found = [(one.module, one.name) for one in imports_of(path, 'p.q.a')]
-    assert found == [('x.y', ''), ('z', ''), ('p.q', 'b'), ('p.q', 'c'), ('p.d', 'e')]
+    assert found == [('x.y', ''), ('z', ''), ('p.q', 'b'), ('p.q', 'c'), ('p.d', 'e'), ('h.i', '')]
 
 
 def test_a_replay_does_not_hang_on_the_number_of_threads():

@@ -11,6 +11,7 @@ from typing import Any
 
 from continuum_loc.errors import BagError
 from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.extras import require_all
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, lost_share, ring_rows
@@ -81,8 +82,10 @@ def evaluate_bags(
     """
     Replay every bag of `folder`; tables, run folders and report go to `out`.
 
-    The one claim is that none failed. Raises BagError or MapError before any work.
+    The one claim is that none failed. Raises BagError, MapError or NotInstalled before
+    any work.
     """
+    require_all('report')  # what writes its tables, asked for before the work
     trials = bag_trials(folder)
     load_map(map_file)  # a map that cannot be read is no bag's fault
     work = [(trial, robot, map_file, settings, out) for trial in trials]

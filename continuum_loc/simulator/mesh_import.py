@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from continuum_loc.errors import SceneError
+from continuum_loc.extras import require
 from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scene_cache import cached_scene
@@ -57,7 +58,7 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
 
 
 def _load(path: Path):
-    import trimesh
+    trimesh = require('trimesh', 'simulate')
 
     if not path.is_file():
         raise SceneError(
