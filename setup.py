@@ -49,12 +49,12 @@ setup(
         'pydantic>=2.4',
         'pyyaml',
         'rosbags>=0.11',
+        'lz4',  # which rosbags brings, as the next; bags that were cut off are read without it
+        "backports.zstd; python_version < '3.14'",
         'typer>=0.12.5',
         'rich',
     ],
     extras_require={
-        # To read clouds and meshes as maps.
-        'maps': ['open3d', 'trimesh'],
         # To simulate, and to draw scenes.
         'simulate': [
             'mujoco>=3.3',
@@ -67,7 +67,7 @@ setup(
         # To write reports and tables.
         'report': ['plotly', 'jinja2', 'pandas', 'pillow'],
         # All that a user of the command line may ask for.
-        'all': ['continuum_loc[maps,simulate,report]'],
+        'all': ['continuum_loc[simulate,report]'],
         # To run the studies of a checkout.
         'studies': ['continuum_loc[all]', 'matplotlib', 'psutil'],
         # To run the tests of a checkout.

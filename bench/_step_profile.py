@@ -31,9 +31,9 @@ PARTS = {
     'ToF: matching and information': [('tof.py', '_add')],
     'strain': [('factors/strain.py', '_add')],
     'gyro': [('factors/gyro.py', '_add')],
-    'priors': [('priors.py', f'_add_{of}') for of in ('time', 'space', 'base', 'bias')],
+    'priors': [('priors.py', '_add')],
     'elimination, solves, covariances': [('chain.py', ANY)],
-    'ToF: reading frames': [('tof.py', 'row'), ('tof.py', '_beams')],
+    'ToF: reading frames': [('tof.py', 'row'), ('tof.py', '_read')],
     'stacking of batches': [('tof.py', 'stack'), ('strain.py', 'stack'), ('gyro.py', 'stack')],
 }
 

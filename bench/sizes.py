@@ -124,7 +124,7 @@ def _maps(samples: list[Measurement], settings: EstimatorSettings, quick: bool) 
     for points in MAPS[:2] if quick else MAPS:
         prior = _random_map(points)
         filter_, seconds = _step(samples, prior, settings)
-        index = filter_.tof.index
+        index = filter_.setup.index
         steps.append((points, seconds))
         lookups.append((points, _lookup(prior, index)))
         memory.append(sum(a.nbytes for a in index.arrays if isinstance(a, np.ndarray)))

@@ -1,9 +1,8 @@
 """
 What one waits for before anything happens: import, help, the first estimate, a node.
 
-Fresh processes, on one core.
-
-Kernels are compiled on the first run on a machine and kept; these rows have them kept. `ours_s` is
+Each is a fresh process on one core. Kernels are compiled on the first run on a machine and kept;
+these rows have them kept. `ours_s` is
 the processor time of the process, `wall_s` what the clock on the wall said meanwhile (more, where
 the machine is shared), `memory_bytes` the greatest resident size by then. The node is the
 estimator with the engine robot and its map, from its start until its log says `ready`: imports,

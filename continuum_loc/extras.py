@@ -15,7 +15,6 @@ from continuum_loc.errors import NotInstalled
 # Modules by extra, as setup.py has them. One that is in several belongs to the first, where it is
 # not said what it was wanted for.
 EXTRAS = {
-    'maps': ('open3d', 'trimesh'),
     'simulate': ('mujoco', 'manifold3d', 'coacd', 'open3d', 'trimesh'),
     'report': ('plotly', 'jinja2', 'pandas', 'PIL'),
     'studies': ('matplotlib', 'psutil'),
@@ -23,7 +22,6 @@ EXTRAS = {
     'ros': ('rclpy',),
 }
 WHAT = {
-    'maps': 'to read clouds and meshes',
     'simulate': 'to simulate and to draw scenes',
     'report': 'to write reports and tables',
     'studies': 'to run studies',

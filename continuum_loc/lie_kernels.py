@@ -1,13 +1,13 @@
 """
 SE(3) for compiled loops: one element at a time, results written into the caller's arrays.
 
-Same conventions as `continuum_loc.lie`, which is the oracle of these functions in the tests.
-Beyond it, `*_jacobian_times` give the exact derivative of J(xi) w with respect to xi, which the
+The conventions are those of `continuum_loc.lie`, which is the oracle of these functions in the
+tests. Beyond it, `polynomial_times` gives the exact derivative of J(xi) w by xi, which the
 Gaussian-process factors and the interpolation need. Arrays are float64 and C-contiguous; no
-function allocates.
+function allocates: they work in records of TWIST and SCRATCH that the caller owns.
 
-Everything that the adjoint generates has the form [[X, Y], [0, X]], so a product of two costs
-three 3x3 products; `_block_product` uses that.
+Everything that the adjoint generates has the form [[X, Y], [0, X]], so that a product of two costs
+three 3x3 products; `block_product` uses that.
 """
 
 from __future__ import annotations
@@ -17,6 +17,25 @@ import math
 from continuum_loc.compiling import kernel
 from continuum_loc.lie import INVERSE_SERIES, LEFT_SERIES, SMALL_ANGLE
 import numpy as np
+
+# A twist x and a power series of its adjoint, f(ad(x)) = sum c_i ad(x)^i.
+TWIST = np.dtype(
+    [
+        ('x', float, 6),
+        ('ad', float, (6, 6)),  # its adjoint matrix
+        ('c', float, 5),  # the coefficients
+        ('dc', float, 5),  # their derivatives by the angle phi, over phi
+    ]
+)
+# Room for what is of no use after a function returns.
+SCRATCH = np.dtype(
+    [
+        ('pose', float, (4, 4)),
+        ('matrix', float, (6, 6)),
+        ('blocks', float, (2, 6, 6)),
+        ('powers', float, (5, 6)),
+    ]
+)
 
 
 @kernel(inline='always')
@@ -39,7 +58,9 @@ def ad(x, out):
     _hat_into(out, 0, 0, x[3], x[4], x[5])
     _hat_into(out, 3, 3, x[3], x[4], x[5])
     _hat_into(out, 0, 3, x[0], x[1], x[2])
-    out[3:, :3] = 0.0
+    for i in range(3):
+        for j in range(3):
+            out[3 + i, j] = 0.0
 
 
 @kernel
@@ -217,7 +238,7 @@ def _taylor(series, square, value, slope):
 
 @kernel
 def right_coefficients(x, c, dc):
-    """C (5,): J_r(x) = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
+    """Write c (5,) and dc (5,) of J_r(x) = sum c_i ad(x)^i, as TWIST has them."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0] = 1.0
@@ -240,11 +261,7 @@ def right_coefficients(x, c, dc):
 
 @kernel
 def right_inverse_coefficients(x, c, dc):
-    """
-    Coefficients c (5,) of J_r(x)^-1 = sum c_i ad(x)^i, and dc (5,).
-
-    dc: derivative of each by the angle phi, over phi.
-    """
+    """Do as `right_coefficients` for J_r(x)^-1 = sum c_i ad(x)^i."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0], c[1], c[3] = 1.0, 0.5, 0.0
@@ -267,9 +284,9 @@ def right_inverse_coefficients(x, c, dc):
 @kernel
 def polynomial(c, A, out, work):
     """
-    Out = c0 I + c1 A + (c2 I + c3 A + c4 A^2) A^2: two products.
+    Out = sum c_i A^i for A of the form [[X, Y], [0, X]]; work (2, 6, 6).
 
-    A of the form [[X, Y], [0, X]]; work (2, 6, 6).
+    As c0 I + c1 A + (c2 I + c3 A + c4 A^2) A^2 it takes two products.
     """
     square, outer = work[0], work[1]
     block_product(A, A, square)
@@ -285,25 +302,28 @@ def polynomial(c, A, out, work):
 
 
 @kernel
-def polynomial_times(c, dc, x, A, w, value, derivative, work, vectors):
+def polynomial_times(twist, w, value, derivative, scratch):
     """
-    Value (6,) = f(A) w and derivative (6, 6) = d(f(ad(x)) w)/dx for f(A) = sum c_i A^i, A = ad(x).
+    Write f(ad(x)) w into value (6,), and its derivative by x into derivative (6, 6).
 
-    With w_i = A^i w: d(w_i)/dx = D_i, D_1 = -ad(w), D_{i+1} = A D_i - ad(w_i); the coefficients
-    themselves add sum (c_i'/phi) w_i [0; phi]^T. work (2, 6, 6), vectors (5, 6).
+    f is the series of `twist`, a TWIST. With w_i = ad(x)^i w: d(w_i)/dx = D_i, D_1 = -ad(w),
+    D_{i+1} = ad(x) D_i - ad(w_i); the coefficients themselves add sum (c_i'/phi) w_i [0; phi]^T.
     """
+    x, c, dc, vectors = twist.x, twist.c, twist.dc, scratch.powers
     for i in range(6):
         vectors[0, i] = w[i]
     for k in range(1, 5):
         bracket(x, vectors[k - 1], vectors[k])
-    derivative[:, :] = 0.0
-    D = work[0]
-    scratch = work[1]
-    D[:, :] = 0.0
+    D, following = scratch.blocks[0], scratch.blocks[1]
+    for i in range(6):
+        for j in range(6):
+            derivative[i, j] = following[i, j] = 0.0
     for k in range(1, 5):
         if k > 1:
-            block_product(A, D, scratch)
-            D[:, :] = scratch
+            block_product(twist.ad, D, following)
+        for i in range(6):
+            for j in range(6):
+                D[i, j] = following[i, j]
         _subtract_ad(D, vectors[k - 1])
         if c[k] != 0.0:
             for i in range(6):
@@ -338,20 +358,10 @@ def _subtract_ad(D, x):
 
 
 @kernel
-def pose_error(T_wanted, T, e, J, W, V, M):
-    """Write e (6,) = Log(T_wanted^-1 T) and its Jacobian J (6, 6) by T; W, V, M a workspace."""
-    relative(T_wanted, T, M[0])
-    log(M[0], e)
-    ad(e, W[0])
-    right_inverse_coefficients(e, V[0], V[1])
-    polynomial(V[0], W[0], J, W[1:3])
-
-
-@kernel
-def workspace():
-    """
-    Scratch that the functions above and the interpolation share.
-
-    Allocate it once outside a loop.
-    """
-    return np.zeros((12, 6, 6)), np.zeros((16, 6)), np.zeros((4, 4, 4))
+def pose_error(T_wanted, T, error, J, scratch):
+    """Write Log(T_wanted^-1 T) into `error`, a TWIST, and its Jacobian by T into J (6, 6)."""
+    relative(T_wanted, T, scratch.pose)
+    log(scratch.pose, error.x)
+    ad(error.x, error.ad)
+    right_inverse_coefficients(error.x, error.c, error.dc)
+    polynomial(error.c, error.ad, J, scratch.blocks)

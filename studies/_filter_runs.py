@@ -16,17 +16,16 @@ from typing import Any
 
 from continuum_loc.closure import is_ours
 from continuum_loc.estimate import Estimate
-from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
+from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import Measurement, NANOSECONDS, nanoseconds, TruthSample
 from continuum_loc.offline.as_json import write_json
-from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.localise import make_filter, trial_settings
 from continuum_loc.offline.metrics import Errors, errors
 from continuum_loc.offline.replay import Filter, replay, samples_of
 from continuum_loc.offline.runs import load_run, Run, save_run
-from continuum_loc.offline.scene_maps import scene_map_file
 from continuum_loc.offline.source import replay_digest
-from continuum_loc.offline.trial_runs import configuration
+from continuum_loc.offline.trial_runs import configuration, trial_map_file
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
@@ -119,6 +118,10 @@ class Witness:
         """Pass the end on."""
         return self._note(self.watched.flush())
 
+    def reset(self) -> None:
+        """Pass a new start on."""
+        self.watched.reset()
+
     def _note(self, estimate: Estimate | None) -> Estimate | None:
         if estimate is not None:
             self.log.append(
@@ -132,11 +135,7 @@ class Witness:
 
 
 def run_cases(cases: Sequence[Case], out: Path, jobs: int) -> list[CaseResult]:
-    """
-    Simulate the recordings and replay the cases that `out` does not hold yet.
-
-    Results are in the order of `cases`.
-    """
+    """Results in the order of `cases`; what `out` does not hold yet is simulated and replayed."""
     failed = record_bags([case.trial for case in cases], out, jobs)
     todo = [(out, case) for case in cases if case.trial.recording not in failed]
     problems = dict(show_progress(parallel(replay_case, todo, jobs), len(todo), 'estimating'))
@@ -167,7 +166,7 @@ def replay_case(out: Path, case: Case) -> tuple[str, str]:
 def _replay(out: Path, case: Case, folder: Path) -> None:
     trial, settings = case.trial, case_settings(case)
     resolved = configuration(trial, estimator=settings, case=case, faults=repr(case.faults))
-    bag, map_file = bag_of(out, trial), scene_map_file(trial.map_scene or trial.scene)
+    bag, map_file = bag_of(out, trial), trial_map_file(trial)
     key = configuration_digest(resolved, code_of(case), made_by(bag), map_file.name)
     if _digest(folder) == key:
         return
@@ -201,12 +200,8 @@ def _digest(folder: Path) -> str | None:
 
 
 def case_settings(case: Case) -> EstimatorSettings:
-    """
-    Return the settings that come with the robot, changed as the case says.
-
-    Raises SettingsError.
-    """
-    data = load_estimator_settings(load_robot(case.trial.robot).name).model_dump()
+    """Change the settings that come with the robot as the case says. Raises SettingsError."""
+    data = trial_settings(case.trial).model_dump()
     for section, value in case.changes.items():
         data[section] = {**data[section], **value} if isinstance(value, dict) else value
     return parse_settings(EstimatorSettings, data, where=case.name)
@@ -281,11 +276,7 @@ def longest_stretch(times: np.ndarray, flags: np.ndarray) -> float:
 
 
 def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
-    """
-    Find the first of `times` (K,) from which on `flags` (K,) stay true.
-
-    inf where the last one is false.
-    """
+    """Find the first of `times` (K,) from which on `flags` (K,) stay true, or inf."""
     wrong = np.flatnonzero(~flags)
     if len(wrong) == 0:
         return float(times[0])

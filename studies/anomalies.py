@@ -1,8 +1,4 @@
-"""
-Scene reconstruction and anomalies, from what the trials of Table II saw.
-
-Against the true meshes and known anomalies.
-"""
+"""Reconstruction and anomalies from what the trials of Table II saw, beside the true meshes."""
 
 from __future__ import annotations
 

@@ -31,6 +31,7 @@ from studies._filter_runs import (
 from studies._pages import write_page
 from studies._turned import Turned
 from studies.support.split import require_unseen
+from studies.support.worlds import by_world, column, in_worlds, told
 
 START, LENGTH, AFTER = 8.0, 2.0, 3.0  # s
 QUICK_START = 1.5  # s
@@ -81,25 +82,31 @@ beside the least share of fitting samples of each kind of sensor.
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """
-    Inject every fault into trials that no number was tuned on.
-
-    `quick`: two faults in one short trial.
-    """
+    """Inject every fault into trials that no number was tuned on; `quick`: two faults into one."""
     cases = fault_cases(quick, seed)
     require_unseen([case.trial for case in cases])
     results = run_cases(cases, out, jobs)
     clean = {result.case.trial: result for result in results if result.case.name == CLEAN}
-    rows = [
-        fault_row(result, clean[result.case.trial])
-        for result in results
-        if result.run and clean[result.case.trial].run and result.case.name != CLEAN
-    ]
-    claims = judge(rows, len(failures(results)))
-    healthy = [clean_row(result) for result in clean.values() if result.run]
-    claims.append(
-        at_most('clean runs: sensors accused', sum(row['accused'] for row in healthy), '', 0)
-    )
+    claims, rows, healthy = [], [], []
+    for world, members in by_world(results, lambda one: one.case.trial).items():
+        found = [
+            fault_row(result, clean[result.case.trial])
+            for result in members
+            if result.run and clean[result.case.trial].run and result.case.name != CLEAN
+        ]
+        whole = [
+            clean_row(result) for result in members if result.case.name == CLEAN and result.run
+        ]
+        accused = sum(row['accused'] for row in whole)
+        claims += told(
+            [
+                *judge(found, len(failures(members))),
+                at_most('clean runs: sensors accused', accused, '', 0),
+            ],
+            world,
+        )
+        rows += column(found, world)
+        healthy += column(whole, world)
     write_study(
         out,
         claims,
@@ -126,7 +133,7 @@ def fault_cases(quick: bool, seed: int) -> list[Case]:
     end = start + LENGTH + (1.5 if quick else AFTER)
     return [
         case
-        for trial in trials
+        for trial in in_worlds(trials)
         for case in (
             Case(CLEAN, trial, end=end),
             *(Case(one.name, trial, end=end, faults=(one.at(start),)) for one in wanted),
@@ -241,11 +248,7 @@ def accused(result: CaseResult, fault: Fault) -> set[str]:
 
 
 def named_at(result: CaseResult, fault: Fault, name: str) -> float:
-    """
-    Time [s] from the fault's start until `name` is suspected or no longer heard.
-
-    inf where it never is.
-    """
+    """Time [s] from the fault's start until `name` is suspected or no longer heard, else inf."""
     steps = [
         step
         for step in noticed(result, fault)

@@ -1,8 +1,4 @@
-"""
-The command line: exit codes, errors in one line, help without heavy imports.
-
-Commands run in their own process.
-"""
+"""The command line, in a process of its own: exit codes, one-line errors, a light --help."""
 
 import json
 import subprocess

@@ -9,6 +9,7 @@ from dataclasses import replace
 from continuum_loc import lie
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.build import sample_mesh
+from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.measurements import TofFrame
 from continuum_loc.robot import load_robot
 from continuum_loc.scene.anomalies import (
@@ -20,6 +21,8 @@ from continuum_loc.scene.anomalies import (
     detect_anomalies,
     Evidence,
     mahalanobis2,
+    missing_evidence,
+    new_evidence,
     precision_recall,
     seen,
     Truth,
@@ -227,7 +230,7 @@ def test_rays_cross_the_mapped_surface_where_they_cross_the_mesh():
     closest = np.einsum('ij,ij->i', origins, directions)
     miss = np.linalg.norm(origins - closest[:, None] * directions, axis=1)
     depth = -closest - np.sqrt(np.maximum(1.0 - miss**2, 0.0))
-    row, found = first_crossings(prior, prior.index(), origins, directions, np.full(2000, 5.0))
+    row, found = first_crossings(prior, prior.index, origins, directions, np.full(2000, 5.0))
     inside = miss < 0.9
     assert np.mean(row[inside] >= 0) > 0.99
     hit = inside & (row >= 0)
@@ -294,9 +297,62 @@ def test_points_on_the_map_pass_the_chi2_test_at_its_level():
     trajectory, mesh = swaying(), room()
     prior = sample_mesh(mesh.vertices, mesh.faces, spacing=0.01)
     cloud = reconstruct(ROBOT, measured(trajectory, mesh, seed=5), trajectory)
-    distance2, _ = mahalanobis2(cloud, prior, 0.3, prior.index())
+    distance2, _ = mahalanobis2(cloud, prior, 0.3, prior.index)
     assert np.mean(distance2 > stats.chi2(3).ppf(0.99)) < 0.02
     assert np.mean(distance2) > 0.5  # nor is the covariance so wide that nothing could ever be new
+
+
+def flat_map(sigma: float, reach: float = 0.4, spacing: float = 0.02):
+    """Map the plane z = 0, whose normal looks up."""
+    ticks = np.arange(-reach, reach, spacing)
+    points = np.stack([*(a.ravel() for a in np.meshgrid(ticks, ticks)), np.zeros(len(ticks) ** 2)])
+    normals = np.tile([0.0, 0.0, 1.0], (points.shape[1], 1))
+    return PriorMap(points.T, normals, np.ones(points.shape[1]), sigma, spacing)
+
+
+def looking_down(heights: np.ndarray, sigma: float) -> Reconstruction:
+    """One beam from 0.5 m above the map's points to each height, known to `sigma` all round."""
+    count = len(heights)
+    ends = np.column_stack([0.02 * np.arange(count) - 0.1, np.zeros(count), heights])
+    return Reconstruction(
+        ends,
+        np.tile(np.eye(3) * sigma**2, (count, 1, 1)),
+        np.full(count, sigma),
+        np.column_stack([ends[:, :2], np.full(count, 0.5)]),
+        np.arange(count),
+        np.zeros(count, int),
+        ('tof',),
+        np.empty((0, 3)),
+        np.empty((0, 3)),
+    )
+
+
+def test_a_point_is_new_beyond_three_of_its_standard_deviations():
+    """
+    Eq. 12 as it comes: 4 mm of the range and 3 mm of the map are 5 mm, so that 15 mm is the bound.
+
+    Nothing nearer than 1 cm is new, however well it is known.
+    """
+    cloud, prior = looking_down(np.array([0.0, 0.0145, 0.0155, 0.018]), 0.004), flat_map(0.003)
+    index = prior.index()
+    distance2, _ = mahalanobis2(cloud, prior, 0.3, index)
+    np.testing.assert_allclose(distance2, [0.0, 2.9**2, 3.1**2, 3.6**2], atol=1e-9)
+    evidence = new_evidence(cloud, prior, AnomalySettings(), index)
+    assert evidence.disagrees.tolist() == [False, False, True, True]
+    sure = looking_down(np.array([0.0095, 0.0105]), 0.0004), flat_map(0.0003)
+    found = new_evidence(*sure, AnomalySettings(), sure[1].index())
+    assert found.disagrees.tolist() == [False, True]
+
+
+def test_a_beam_is_through_the_map_beyond_three_of_its_standard_deviations():
+    """The same 15 mm: one that ends 14.5 mm behind the surface still agrees with it."""
+    cloud, prior = looking_down(np.array([-0.0145, -0.0155, -0.2]), 0.004), flat_map(0.003)
+    beams, settings = Beams.of(cloud), AnomalySettings()
+    np.testing.assert_allclose(beams.margin(prior, settings), 0.015, rtol=1e-9)
+    evidence = missing_evidence(beams, prior, settings, prior.index())
+    assert evidence.disagrees.tolist() == [False, True, True]
+    sure = Beams.of(looking_down(np.array([0.0]), 0.0001))
+    np.testing.assert_allclose(sure.margin(flat_map(0.0001), settings), 0.01)
 
 
 def test_witnesses_to_the_contrary_lower_the_confidence():
@@ -343,7 +399,7 @@ def test_what_an_edge_of_the_map_explains_is_no_anomaly(kind, x, length, explain
         kind, np.zeros((count, 3)), np.zeros(3), np.zeros(3), count, count, 1.0, np.arange(count)
     )
     settings = AnomalySettings()
-    share = unexplained_share(cluster, beams, prior, settings, prior.index())
+    share = unexplained_share(cluster, beams, prior, settings, prior.index)
     # Discs leave holes of 3 %, and one in any of a beam's seven lines explains it.
     assert share < 0.1 if explained else share > 0.97**7 - 0.15
 

@@ -132,13 +132,14 @@ def test_package_xml_is_what_colcon_takes_for_ament_python():
 def _imported(*packages):
     """Names of the modules of others that our packages import, wherever in them."""
     own = {'continuum_loc', 'msg_tools', 'studies', 'bench'}
+    later = {'compression'}  # in Python's own library from 3.14 on
     found = {
         imported.module.partition('.')[0]
         for package in packages
         for path in (ROOT / package).rglob('*.py')
         for imported in imports_of(path, '.'.join(path.relative_to(ROOT).with_suffix('').parts))
     }
-    return found - set(sys.stdlib_module_names) - own
+    return found - set(sys.stdlib_module_names) - own - later
 
 
 def _setup():
@@ -154,10 +155,17 @@ def _setup():
         if keyword.arg in ('install_requires', 'extras_require')
     }
     lines = {'': given['install_requires'], **given['extras_require']}
-    return {extra: {re.split(r'[<>=\[]', one)[0] for one in all_} for extra, all_ in lines.items()}
+    return {
+        extra: {re.split(r'[<>=\[;]', one)[0] for one in all_} for extra, all_ in lines.items()
+    }
 
 
-MODULES = {'pyyaml': 'yaml', 'pillow': 'PIL', 'ros-jazzy-rclpy': 'rclpy'}
+MODULES = {
+    'backports.zstd': 'backports',
+    'pyyaml': 'yaml',
+    'pillow': 'PIL',
+    'ros-jazzy-rclpy': 'rclpy',
+}
 NO_MODULE = {'ros-common-interfaces', 'dask', 'continuum_loc'}  # messages; part of distributed; us
 
 
@@ -188,6 +196,7 @@ def test_what_is_told_to_be_installed_is_what_setup_py_has():
 KEYS = {
     'python3-numba': {'numba', 'llvmlite'},
     'python3-pil': {'PIL'},
+    'python3-rosbags-pip': {'rosbags', 'lz4', 'backports'},
     'ros2launch': {'launch', 'launch_ros'},
 }
 

@@ -74,6 +74,30 @@ def test_an_error_is_silent_where_the_filter_does_not_say_lost(result):
     )
 
 
+def test_what_a_lost_filter_says_is_judged_like_the_rest(result):
+    """
+    Three of the 25 instants are 0.2 m off at one of five rings, and the filter says so.
+
+    Left out, the greatest error would be that of the rest; counted, they add 0.2 * 3 / (25 * 5) to
+    the mean at all rings, and are as far outside of their covariance as they are.
+    """
+    track = result.track
+    off, said = track.T_map_ring.copy(), track.status.copy()
+    off[10:13, 3, 0, 3] += 0.2
+    said[10:13] = 'lost'
+    before = summary_of(result)
+    after = summary_of(replace(result, track=replace(track, T_map_ring=off, status=said)))
+    assert after['estimates']['judged'] == 25
+    assert (after['estimates']['tracking'], after['estimates']['lost']) == (22, 3)
+    assert after['poses'] == 25 * 5
+    assert after['translation_max_m'] == pytest.approx(0.2, abs=0.01)
+    grown = after['translation_mae_m'] - before['translation_mae_m']
+    assert grown == pytest.approx(0.2 * 3 / 125, rel=0.05)
+    missed = before['coverage_95'] - after['coverage_95']
+    assert missed * 125 == pytest.approx(3.0, abs=0.5)
+    assert after['nees_per_dof'] > 50.0 * before['nees_per_dof']
+
+
 def test_real_time_factor_is_data_time_over_processing_time(result):
     assert result.data_seconds == pytest.approx(2.99)
     assert result.real_time_factor == pytest.approx(2.99 / result.processing_seconds)

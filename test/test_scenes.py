@@ -1,8 +1,4 @@
-"""
-Scenes: closed, of the stated size, with free way for the robot.
-
-And with exact truth of their anomalies.
-"""
+"""Scenes: closed, of the stated size, with free way and exact truth of their anomalies."""
 
 from continuum_loc.caches import cache_folder
 from continuum_loc.errors import SceneError

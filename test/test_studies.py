@@ -1,8 +1,4 @@
-"""
-Campaigns lose no trial and repeat none; the split is kept.
-
-Benchmarks and tuning judge as they say.
-"""
+"""Campaigns lose no trial and repeat none; split, benchmarks and tuning judge as they say."""
 
 from dataclasses import replace
 import json
@@ -32,6 +28,7 @@ from studies._soft_arm import soft_arm_trials
 from studies.support import campaign
 from studies.support.campaign import Outcome, run_campaign
 from studies.support.split import HOLD_OUT, is_hold_out, require_unseen
+from studies.support.worlds import in_worlds, told
 
 
 def outcome(trial, translation=0.001, rotation=0.1, silent=0.0):
@@ -207,6 +204,19 @@ def test_the_soft_arm_campaign_is_the_papers():
     assert len({trial.recording for trial in trials}) == 23
     assert len({(trial.map_scene, trial.scene) for trial in trials}) == 13
     assert len(table2.trials(False, 0)) == 30
+
+
+def test_every_condition_has_the_same_trials_and_worlds_are_told_apart():
+    """The disturbed world has its own sensors; a claim of it says so."""
+    trials = soft_arm_trials(False, 0)
+    assert len(trials) == 3 * 61 and len({trial.name for trial in trials}) == 3 * 61
+    disturbed = [trial for trial in trials if trial.world == 'disturbed']
+    assert len(disturbed) == 61 and {trial.fidelity for trial in disturbed} == {'vl53l5cx'}
+    both = in_worlds(table2.trials(True, 0))
+    assert [trial.world for trial in both] == ['ideal'] * 2 + ['disturbed'] * 2
+    claims = table2.judge([outcome(trial) for trial in both[2:]])
+    assert {claim.name for claim in told(claims, 'ideal')} == {claim.name for claim in claims}
+    assert all(claim.name.startswith('disturbed: ') for claim in told(claims, 'disturbed'))
 
 
 def test_no_claim_rests_on_the_hold_out():

@@ -227,12 +227,9 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
-        """Make a filter without a past, which no graph asks for, and with all its memory."""
+        """Make a filter without a past, which no graph asks for."""
         settings = self.filter_settings.model_copy(update={'history': 0.0})
-        made = SlidingWindowFilter(robot, self.prior_map, settings)
-        if made.tof is not None:
-            made.tof.index.reserve()
-        return made
+        return SlidingWindowFilter(robot, self.prior_map, settings)
 
     def _preset(self) -> EstimatorSettings:
         """Use the settings asked for, else those bundled for this robot, else the library's."""
@@ -248,9 +245,12 @@ class EstimatorNode(WorkerNode):
         if not self.settings.map:
             self.get_logger().warning('no prior map: ToF sensors cannot be used (parameter `map`)')
             return None
-        from continuum_loc.mapping.map_files import load_map
+        from continuum_loc.mapping.scale import map_for
 
-        return load_map(self.settings.map)
+        prior = map_for(self.robot, self.settings.map)
+        for note in prior.notes:
+            self.get_logger().warning(f'{self.settings.map}: {note}')
+        return prior
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:

@@ -13,6 +13,8 @@ from continuum_loc.errors import BagError
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.extras import require_all
 from continuum_loc.mapping.map_files import load_map
+from continuum_loc.mapping.scale import map_for
+from continuum_loc.offline.account import account_of
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, lost_share, ring_rows
 from continuum_loc.offline.localise import make_filter
@@ -22,13 +24,12 @@ from continuum_loc.offline.parallel import (
     parallel,
     show_progress,
 )
-from continuum_loc.offline.replay import replay, ReplayResult
-from continuum_loc.offline.runs import save_run
+from continuum_loc.offline.replay import replay
+from continuum_loc.offline.runs import save_run, summary_of
 from continuum_loc.offline.source import content_digest, replay_digest
 from continuum_loc.offline.study_report import write_study_report
 from continuum_loc.robot import RobotDescription
-
-BAG_SUFFIXES = ('.mcap', '.db3')
+from msg_tools.bag import BAG_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def evaluate_bags(
     """
     require_all('report')  # what writes its tables, asked for before the work
     trials = bag_trials(folder)
-    load_map(map_file)  # a map that cannot be read is no bag's fault
+    map_for(robot, map_file)  # a map that cannot be used is no bag's fault
     work = [(trial, robot, map_file, settings, out) for trial in trials]
     outcomes = sorted(
         show_progress(parallel(replay_bag, work, jobs), len(work), 'estimating'),
@@ -146,7 +147,9 @@ def _summary(
             return summary
     (folder / 'error.txt').unlink(missing_ok=True)
     result = replay(trial.bag, make_filter(robot, load_map(map_file), settings))
-    require_estimates(result, robot)
+    account = account_of(robot, settings, result.counts, summary_of(result))
+    if account['problems']:
+        raise BagError('; '.join(account['problems']))
     return save_run(
         folder,
         result,
@@ -159,21 +162,6 @@ def _summary(
             'estimator': settings,
         },
         extra={'configuration_digest': key},
-    )
-
-
-def require_estimates(result: ReplayResult, robot: RobotDescription) -> None:
-    """Raise BagError where a recording gave no estimate, with what became of its samples."""
-    if len(result.track):
-        return
-    counted = (
-        f'{what} {", ".join(f"{count} {name}" for name, count in result.counts[what].items())}'
-        for what in ('received', 'used', 'dropped')
-        if result.counts[what]
-    )
-    raise BagError(
-        f"no estimate: {'; '.join(counted) or 'no measurement in it'}; robot '{robot.name}' has "
-        f'the ToF sensors {", ".join(one.name for one in robot.tof) or "none"}'
     )
 
 

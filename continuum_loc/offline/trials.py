@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+import hashlib
 from pathlib import Path
 import shutil
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
+    from continuum_loc.simulator.departures import Departures
     from continuum_loc.simulator.world import World
 
 # What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF
@@ -38,6 +40,8 @@ class Trial:
     map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
     `paper` or `vl53l5cx`. plant: a bundled name or a YAML file; None for the robot's own.
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
+    world: `ideal`, or a file of true departures (`simulator.departures`), which also says what ToF
+    sensors it has; the prior map departs with it.
     drawn_base: the base sits where a draw from the description's own spread puts it, not where
     the description says: what a covariance that counts with this spread has to be judged by.
     duration: seconds; None for the trajectory's own.
@@ -54,6 +58,17 @@ class Trial:
     seed: int = 0
     duration: float | None = None
     plant: str | None = None
+    world: str = 'ideal'
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'fidelity', self.departures.fidelity(self.fidelity))
+
+    @property
+    def departures(self) -> Departures:
+        """In what the trial's world departs from the files that the estimator reads."""
+        from continuum_loc.simulator.departures import load_departures
+
+        return load_departures(self.world)
 
     @property
     def recording(self) -> str:
@@ -70,6 +85,7 @@ class Trial:
                 ]
                 + ['disturbed'] * self.disturbed
                 + ['drawn'] * self.drawn_base
+                + [f'world_{_world_name(self.world)}'] * (self.world != 'ideal')
                 + [Path(self.plant or '').stem] * bool(self.plant)
             )
             + f'-{self.seed}{length}'
@@ -79,6 +95,14 @@ class Trial:
     def name(self) -> str:
         """Name the trial, uniquely among trials."""
         return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
+
+
+def _world_name(world: str) -> str:
+    """Name a world in a folder's name; a file of one's own by what it says."""
+    name, _, parts = world.partition(':')
+    own = Path(name).suffix in ('.yaml', '.yml')
+    said = f'_{hashlib.sha256(Path(name).read_bytes()).hexdigest()[:8]}' if own else ''
+    return f'{Path(name).stem}{said}{"_" * bool(parts)}{parts.replace("+", "_")}'
 
 
 def world(trial: Trial, faults: tuple = ()) -> World:
@@ -91,9 +115,24 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         robot = _base_drawn(robot, trial.seed)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
+    scene = load_scene(trial.scene) if robot.tof else None
+    if trial.world != 'ideal':
+        from continuum_loc.offline.disturbed import true_world
+
+        return true_world(
+            robot,
+            scene,
+            trial.trajectory,
+            trial.departures,
+            seed=trial.seed,
+            fidelity=trial.fidelity,
+            plant=trial.plant,
+            profile=trial.profile,
+            faults=faults,
+        )
     return World(
         robot,
-        load_scene(trial.scene) if robot.tof else None,
+        scene,
         trial.trajectory,
         plant=trial.plant,
         profile=trial.profile,

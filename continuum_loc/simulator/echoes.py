@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-TOF_TOO_CLOSE = 4  # the driver reports a consistency failure there
+TOF_TOO_CLOSE = 4  # a consistency failure
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +26,17 @@ class Echoes:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Per sensor and zone (S, Z), as in `TofFrame`: ranges [m], stated sigma [m], status."""
+    """
+    Per sensor and zone (S, Z), as in `TofFrame`: ranges [m], stated sigma [m], status.
+
+    raw: (S, Z) distance in the driver's registers [m], where the receiver has such; no frame
+    carries it.
+    """
 
     ranges: np.ndarray
     sigma: np.ndarray
     status: np.ndarray
+    raw: np.ndarray | None = None
 
 
 class Receiver(Protocol):

@@ -12,10 +12,10 @@ from contextlib import suppress
 import hashlib
 import os
 from pathlib import Path
-from zipfile import BadZipFile
 
 from continuum_loc.caches import cache_folder
 from continuum_loc.closure import digest_of_code
+from continuum_loc.npz_files import read_arrays
 from continuum_loc.simulator.scene import Anomaly, Scene
 import numpy as np
 
@@ -36,7 +36,7 @@ def cached_scene(
     entry = cache_folder(KIND) / f'{name}-{digest.hexdigest()[:16]}.npz'
     try:
         return _read(entry)
-    except (OSError, KeyError, ValueError, BadZipFile):
+    except (OSError, KeyError, ValueError):
         scene = build()  # absent, or cut short by a crash
     _write(scene, entry)
     return scene
@@ -66,27 +66,27 @@ def _write(scene: Scene, entry: Path) -> None:
 
 
 def _read(entry: Path) -> Scene:
-    with np.load(entry) as data:
-        anomalies = zip(
-            data['anomaly_names'],
-            data['anomaly_kinds'],
-            _unpack(data, 'anomaly_vertices'),
-            _unpack(data, 'anomaly_faces'),
-            strict=True,
-        )
-        return Scene(
-            str(data['name']),
-            data['vertices'],
-            data['faces'],
-            data['face_object'],
-            tuple(map(str, data['objects'])),
-            data['reflectance'],
-            tuple(_unpack(data, 'hulls')),
-            tuple(
-                Anomaly(str(name), str(kind), vertices, faces)
-                for name, kind, vertices, faces in anomalies
-            ),
-        )
+    data = read_arrays(entry)
+    anomalies = zip(
+        data['anomaly_names'],
+        data['anomaly_kinds'],
+        _unpack(data, 'anomaly_vertices'),
+        _unpack(data, 'anomaly_faces'),
+        strict=True,
+    )
+    return Scene(
+        str(data['name']),
+        data['vertices'],
+        data['faces'],
+        data['face_object'],
+        tuple(map(str, data['objects'])),
+        data['reflectance'],
+        tuple(_unpack(data, 'hulls')),
+        tuple(
+            Anomaly(str(name), str(kind), vertices, faces)
+            for name, kind, vertices, faces in anomalies
+        ),
+    )
 
 
 def _pack(
@@ -101,6 +101,6 @@ def _pack(
     }
 
 
-def _unpack(data: np.lib.npyio.NpzFile, name: str) -> list[np.ndarray]:
+def _unpack(data: dict[str, np.ndarray], name: str) -> list[np.ndarray]:
     ends = data[f'{name}_ends']
     return np.split(data[name], ends[:-1]) if len(ends) else []

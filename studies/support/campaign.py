@@ -180,12 +180,11 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
     from continuum_loc.offline.localise import make_filter, trial_settings
     from continuum_loc.offline.replay import replay
     from continuum_loc.offline.runs import save_run
-    from continuum_loc.offline.scene_maps import scene_map_file
-    from continuum_loc.offline.trial_runs import configuration
+    from continuum_loc.offline.trial_runs import configuration, trial_map_file
     from continuum_loc.robot import load_robot
 
     settings = settings or trial_settings(trial)
-    map_file = scene_map_file(trial.map_scene or trial.scene)
+    map_file = trial_map_file(trial)
     resolved = configuration(trial, estimator=settings)
     key = configuration_digest(
         resolved, asdict(trial), replay_digest(__name__), made_by(bag), map_file.name

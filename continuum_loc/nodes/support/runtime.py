@@ -15,9 +15,10 @@ import threading
 from typing import Any
 from weakref import WeakSet
 
-from continuum_loc.errors import ContinuumLocError
+from continuum_loc.errors import ContinuumLocError, SettingsError
 from continuum_loc.extras import explained
 from continuum_loc.nodes.support.parameters import (
+    check_arguments,
     declare,
     guard,
     live_fields,
@@ -34,6 +35,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 
 BAD_INPUT = 2
@@ -51,6 +53,7 @@ class PackageNode(Node):
         super().__init__(name, **options)
         _nodes.add(self)
         self.finished = Future()
+        self.failure: Exception | None = None
         self.settings = declare(self, defaults)
         self._guarded = False
 
@@ -58,6 +61,27 @@ class PackageNode(Node):
         """End the spin of this node (from any thread)."""
         if not self.finished.done():
             self.finished.set_result(None)
+
+    def fail(self, error: Exception) -> None:
+        """End the node with an error (from any thread); the first one counts."""
+        self.failure = self.failure or error
+        self.finish()
+
+    def thread(self, work: Callable[[], None], name: str) -> threading.Thread:
+        """
+        Make a thread whose failure is the node's, which ends then with an error.
+
+        A node that lives on without one of its threads is deaf or mute, and nobody knows.
+        """
+
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:
+                if self.context.ok():  # else it is the end that surfaces, as any of rclpy's errors
+                    self.fail(error)
+
+        return threading.Thread(target=guarded, name=name, daemon=True)
 
     def close(self) -> None:
         """Stop threads, write files. Called once, after the last callback."""
@@ -120,17 +144,18 @@ class PackageNode(Node):
 
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     """
-    Make a node and spin it until it finishes or is told to stop.
+    Make a node, spin it until it finishes or is told to stop, and return the exit code.
 
-    Returns the exit code (2: bad input).
+    The code is 0, or 2 where something that was given cannot be used.
     """
     _provide_log_folder()
     try:
+        check_arguments(sys.argv if args is None else args)
         rclpy.init(args=args)
-    except RCLError as error:  # arguments after --ros-args that ROS does not understand
+    except (RCLError, SettingsError) as error:  # arguments that cannot be understood
         print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
-    node: PackageNode | None = None
+    node, failure = None, None
     making = _Making(make)
     try:
         node = making.result()
@@ -139,16 +164,24 @@ def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
         pass
     except Exception as error:
         # A signal may surface as any of rclpy's errors, from a publish in flight for instance.
-        if rclpy.ok():
-            return _complain(error)
+        failure = error if rclpy.ok() else None
     finally:
         _ignore_signals()
         if node is not None:
-            node.close()
-            node.destroy_node()
+            failure = _closed(node, failure or node.failure)
         rclpy.try_shutdown()
         making.abandon()
-    return 0
+    return 0 if failure is None else _complain(failure)
+
+
+def _closed(node: PackageNode, failure: Exception | None) -> Exception | None:
+    """Close a node that has failed or not; what went wrong, first."""
+    try:
+        node.close()
+    except Exception as error:
+        failure = failure or error
+    node.destroy_node()
+    return failure
 
 
 class _Making:
@@ -248,11 +281,16 @@ def _provide_log_folder() -> None:
         os.environ['ROS_LOG_DIR'] = tempfile.gettempdir()
 
 
+def deserialized(data: bytes, type_name: str) -> Any:
+    """Return the rclpy message of a type such as `sensor_msgs/msg/Imu` that was taken raw."""
+    return deserialize_message(data, ros_messages().resolve(type_name))
+
+
 def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
     """
-    Best effort hears reliable and best-effort publishers alike.
+    Quality of service of an input: best effort hears every publisher.
 
-    The depth bridges a slow moment.
+    The depth of its queue bridges a slow moment of the node.
     """
     reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=reliability)
