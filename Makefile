@@ -35,6 +35,7 @@ test: install
 lint: install
 	$(RUN)/ruff check .
 	$(RUN)/ruff format --check .
+	$(RUN)/lint-imports
 	$(call ament,ament_flake8 $(SOURCES),its rules are checked by ruff and the tests alone)
 	$(call ament,ament_pep257 $(SOURCES),its rules are checked by ruff alone)
 	$(call ament,ament_xmllint package.xml,package.xml is checked by the tests alone)
@@ -49,5 +50,5 @@ profile: install
 	$(RUN)/python bench/_step_profile.py
 
 clean:
-	rm -rf $(VENV) build dist install log .pytest_cache .ruff_cache .hypothesis .cache *.egg-info
+	rm -rf $(VENV) build dist install log .pytest_cache .ruff_cache .import_linter_cache .hypothesis .cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -24,7 +24,7 @@ setup(
     license='Apache-2.0',
     packages=find_packages(include=['continuum_loc*', 'msg_tools*']),
     package_data={
-        'continuum_loc': ['robots/*.yaml', '**/*.yaml', '**/*.html', '**/*.j2', '**/*.rviz']
+        'continuum_loc': ['**/*.yaml', '**/*.html', '**/*.js', '**/*.j2'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -38,35 +38,58 @@ setup(
         (f'lib/{NAME}', _files('resource/executables', '*')),
     ],
     python_requires='>=3.11',
+    # What the nodes, `replay` and `shape` need; for everything else there are extras, and
+    # `continuum_loc.extras` says which of them brings what is missing.
     install_requires=[
-        'setuptools',
-        'numpy',
-        'scipy',
-        'numba',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'numba>=0.58',
         'threadpoolctl',
-        'pydantic>=2',
+        'pydantic>=2.4',
         'pyyaml',
         'rosbags>=0.11',
-        'typer',
+        'lz4',  # which rosbags brings, as the next; bags that were cut off are read without it
+        "backports.zstd; python_version < '3.14'",
+        'typer>=0.12.5',
         'rich',
-        'mujoco>=3.3',
-        'open3d',
-        'trimesh',
-        'manifold3d',
-        'coacd',
-        'pandas',
-        'jinja2',
-        'plotly',
-        'matplotlib',
-        'psutil',
-        'pillow',
     ],
     extras_require={
+        # To simulate, and to draw scenes.
+        'simulate': [
+            'mujoco>=3.3',
+            'manifold3d',
+            'coacd',
+            'open3d',
+            'trimesh',
+            'scipy>=1.14',
+        ],
+        # To write reports and tables.
+        'report': ['plotly', 'jinja2', 'pandas', 'pillow'],
+        # All that a user of the command line may ask for.
+        'all': ['continuum_loc[simulate,report]'],
+        # To run the studies of a checkout.
+        'studies': ['continuum_loc[all]', 'matplotlib', 'psutil'],
+        # To run the tests of a checkout.
+        'test': [
+            'continuum_loc[studies]',
+            'pytest',
+            'pytest-timeout',
+            'hypothesis',
+            'evo',
+            'ruff',
+            'import-linter',
+        ],
+        # To run the benchmarks of a checkout: what they compare with.
+        'bench': [
+            'continuum_loc[studies]',
+            'gtsam',
+            'mcap-ros2-support',
+            'small_gicp',
+        ],
+        # To spread studies over a cluster.
+        'cluster': ['dask', 'distributed'],
         # Where there is no ROS 2 installation, the same Jazzy packages as wheels.
         'ros': ['ros-jazzy-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
-        'test': ['pytest', 'pytest-timeout', 'hypothesis', 'evo', 'ruff'],
-        'bench': ['gtsam', 'mcap-ros2-support', 'small_gicp'],
-        'cluster': ['dask', 'distributed'],
     },
     zip_safe=False,
     maintainer='continuum_loc maintainers',

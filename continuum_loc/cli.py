@@ -18,7 +18,14 @@ import shutil
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
-from continuum_loc.errors import ContinuumLocError, InputError, MapError, StudyError
+from continuum_loc.errors import (
+    ContinuumLocError,
+    InputError,
+    MapError,
+    NotInstalled,
+    StudyError,
+)
+from continuum_loc.extras import explained
 from rich.console import Console
 from rich.markup import escape
 import typer
@@ -73,8 +80,18 @@ def main() -> None:
     try:
         app()
     except ContinuumLocError as error:
-        errors.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False, soft_wrap=True)
-        sys.exit(USAGE if isinstance(error, InputError) else FAILED)
+        _complain(error)
+    except ModuleNotFoundError as error:
+        told = explained(error)
+        if told is error:
+            raise
+        _complain(told)
+
+
+def _complain(error: ContinuumLocError) -> None:
+    """Say what went wrong in one line, and end."""
+    errors.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False, soft_wrap=True)
+    sys.exit(USAGE if isinstance(error, InputError) else FAILED)
 
 
 @app.command()
@@ -261,7 +278,6 @@ def replay(
     }
     folder = new_run('replay', out)
     summary = save_run(folder, result, kind='replay', seed=seed, configuration=configuration)
-    _write_report(folder)
     raise typer.Exit(USAGE if _tell(folder, summary) else OK)
 
 
@@ -304,7 +320,6 @@ def shape(
     configuration = {'robot': description, 'bag': bag, 'estimator': estimator.settings}
     folder = new_run('shape', out)
     summary = save_run(folder, result, kind='shape', seed=None, configuration=configuration)
-    _write_report(folder)
     raise typer.Exit(USAGE if _tell(folder, summary) else OK)
 
 
@@ -506,7 +521,7 @@ def evaluate(
 
 def _run_study(name: str, run: Any, out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     """Run a study; one that is reported is entered into the books, unless it is a quick run."""
-    from studies.support import books
+    from studies import _books as books
 
     if quick:
         return run(out, quick, seed, jobs)
@@ -750,10 +765,23 @@ def _tell(folder: Path, summary: dict[str, Any]) -> bool:
     for line in account_lines(summary['account']):
         style = 'bold red' if line.startswith('PROBLEM') else ''
         console.print(escape(line), style=style, highlight=False)
+    _report_where_it_can(folder)
+    return bool(summary['account']['problems'])
+
+
+def _report_where_it_can(folder: Path) -> None:
+    """Write the report of a run, which stands without it where its libraries are missing."""
+    try:
+        if not (folder / 'report.html').is_file():
+            _write_report(folder)
+    except NotInstalled as error:
+        console.print(f'run     {folder}')
+        said = f'[yellow]no report:[/] {escape(str(error))}'
+        errors.print(said, highlight=False, soft_wrap=True)
+        return
     console.print(
         f'report  [link=file://{folder.absolute()}/report.html]{folder}/report.html[/link]'
     )
-    return bool(summary['account']['problems'])
 
 
 def _run_table(summary: dict[str, Any]) -> Any:

@@ -131,6 +131,8 @@ def _imports_in(code: bytes, package: str) -> tuple[Imported, ...]:
     for node in _runs(ast.parse(code)):
         if isinstance(node, ast.Import):
             found += [Imported(alias.name) for alias in node.names]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == 'require':
+            found += [Imported(node.args[0].value)]  # of a library that an extra brings
         elif isinstance(node, ast.ImportFrom):
             above = folders[: len(folders) + 1 - node.level] if node.level else []
             module = '.'.join([*above, *filter(None, [node.module])])

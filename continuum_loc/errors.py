@@ -81,6 +81,10 @@ class StudyError(InputError):
     """A study or benchmark that does not exist or cannot be run as asked."""
 
 
+class NotInstalled(InputError):
+    """A library that only some uses need is not installed; the message says what to type."""
+
+
 class SingularError(ContinuumLocError, ArithmeticError):
     """An elimination met a matrix that is not positive definite; `column` says at which one."""
 

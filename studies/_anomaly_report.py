@@ -12,10 +12,10 @@ from continuum_loc.offline.report import chart, Page, Part, render
 from continuum_loc.offline.study_report import as_table, claims_part
 from continuum_loc.scene.anomalies import AnomalySettings
 import numpy as np
+from studies._scene_result import SceneResult
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
-    from studies.anomalies import SceneResult
 
 COLOURS = {'added': '#c0392b', 'missing': '#2457a6'}
 MOST_SCENES = 4  # pictures in one page: each is about half a megabyte

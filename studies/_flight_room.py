@@ -14,7 +14,7 @@ from continuum_loc.simulator.raycast import RayCaster
 from continuum_loc.simulator.readout import Readout, ReadoutSettings
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.tof import TofSensorModel
-from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
+from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation

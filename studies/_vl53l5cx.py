@@ -12,9 +12,8 @@ from typing import Any
 
 from continuum_loc.measurements import TOF_VALID
 from continuum_loc.robot import load_robot, TofModel
-from continuum_loc.simulator.tof import Echoes
+from continuum_loc.simulator.echoes import Echoes
 from continuum_loc.simulator.vl53l5cx import (
-    AMBIENT_UNIT,
     STATUS_FAINT,
     STATUS_NEW_TARGET,
     STATUS_STRAY,
@@ -22,6 +21,7 @@ from continuum_loc.simulator.vl53l5cx import (
     Vl53l5cxReceiver,
     Vl53l5cxSettings,
 )
+from continuum_loc.simulator.vl53l5cx_settings import AMBIENT_UNIT
 import numpy as np
 
 FRAMES = 300

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from continuum_loc.offline.scene_maps import scene_map
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.scene.anomalies import (
-    AnomalyCluster,
     AnomalySettings,
     detect_anomalies,
     precision_recall,
@@ -31,6 +30,7 @@ from continuum_loc.scene.reconstruct import (
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np
 from studies._anomaly_report import write_anomaly_report
+from studies._scene_result import SceneResult
 from studies.support.campaign import (
     bag_of,
     Outcome,
@@ -47,28 +47,6 @@ SHOWN_SURFELS = 15_000  # in the report's picture of a scene
 LEAST_SIZE = 0.03  # m: smaller anomalies are not asked for
 # Trials of one scene all begin at the same stamp: keep their instants apart.
 APART = 10_000 * NANOSECONDS
-
-
-@dataclass(frozen=True, eq=False)
-class SceneResult:
-    """
-    What the trials of one scene gave.
-
-    rmse_m: of the fused surfels, of the measured points, and of points placed by the true poses
-    (the sensors' share) to the true mesh. covered: share of the surfels whose distance to it is
-    within 3 standard deviations. truth: the known anomalies that were seen, of `known`. fused:
-    what the picture shows.
-    """
-
-    scene: str
-    points: int
-    surfels: int
-    rmse_m: dict[str, float]
-    covered: float
-    clusters: list[AnomalyCluster]
-    truth: list[Truth]
-    known: int
-    fused: np.ndarray
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:

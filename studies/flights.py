@@ -15,7 +15,7 @@ from typing import Any
 
 from continuum_loc.errors import InputError
 from continuum_loc.offline.claims import at_most, between, Claim, write_study
-from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
+from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 import numpy as np
 from studies._flight_room import simulated_flight
 from studies._flight_statistics import (

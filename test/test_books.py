@@ -3,7 +3,7 @@
 from continuum_loc.errors import StudyError
 from continuum_loc.offline.claims import at_most
 import pytest
-from studies.support import books
+from studies import _books as books
 
 CLAIMS = [at_most('too far', 2.0, 'cm', 1.0), at_most('near', 0.5, 'cm', 1.0)]
 

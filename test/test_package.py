@@ -9,8 +9,11 @@ import shutil
 import subprocess
 import sys
 import tokenize
+import tomllib
 import xml.etree.ElementTree as ElementTree
 
+from continuum_loc.closure import imports_of
+from continuum_loc.extras import EXTRAS, WHAT
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -126,9 +129,101 @@ def test_package_xml_is_what_colcon_takes_for_ament_python():
     assert (ROOT / 'resource' / 'continuum_loc').is_file()
 
 
-def test_pyproject_leaves_the_metadata_to_setup_py():
-    import tomllib
+def _imported(*packages):
+    """Names of the modules of others that our packages import, wherever in them."""
+    own = {'continuum_loc', 'msg_tools', 'studies', 'bench'}
+    later = {'compression'}  # in Python's own library from 3.14 on
+    found = {
+        imported.module.partition('.')[0]
+        for package in packages
+        for path in (ROOT / package).rglob('*.py')
+        for imported in imports_of(path, '.'.join(path.relative_to(ROOT).with_suffix('').parts))
+    }
+    return found - set(sys.stdlib_module_names) - own - later
 
+
+def _setup():
+    """List the distributions that are required, by extra ('' for the base)."""
+    call = next(
+        node
+        for node in ast.walk(ast.parse((ROOT / 'setup.py').read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == 'setup'
+    )
+    given = {
+        keyword.arg: ast.literal_eval(keyword.value)
+        for keyword in call.keywords
+        if keyword.arg in ('install_requires', 'extras_require')
+    }
+    lines = {'': given['install_requires'], **given['extras_require']}
+    return {
+        extra: {re.split(r'[<>=\[;]', one)[0] for one in all_} for extra, all_ in lines.items()
+    }
+
+
+MODULES = {
+    'backports.zstd': 'backports',
+    'pyyaml': 'yaml',
+    'pillow': 'PIL',
+    'ros-jazzy-rclpy': 'rclpy',
+}
+NO_MODULE = {'ros-common-interfaces', 'dask', 'continuum_loc'}  # messages; part of distributed; us
+
+
+def test_setup_py_names_all_that_the_package_imports_and_nothing_else():
+    setup = _setup()
+    modules = {
+        extra: {MODULES.get(one, one) for one in names - NO_MODULE}
+        for extra, names in setup.items()
+        if extra not in ('test', 'bench', 'all')
+    }
+    named = set().union(*modules.values())
+    imported = _imported('continuum_loc', 'msg_tools')
+    assert imported - set(ROS) <= named
+    assert named - imported == {'matplotlib', 'psutil'}  # of the studies alone
+    assert _imported('studies') <= named | {'numpy'}
+    assert modules[''] <= imported
+
+
+def test_what_is_told_to_be_installed_is_what_setup_py_has():
+    setup = _setup()
+    assert set(EXTRAS) == set(WHAT) == set(setup) - {'', 'all', 'test', 'bench'}
+    for extra, modules in EXTRAS.items():
+        named = {MODULES.get(one, one) for one in setup[extra] - NO_MODULE - setup['']}
+        assert set(modules) == named, extra
+        assert not set(modules) & setup['']
+
+
+KEYS = {
+    'python3-numba': {'numba', 'llvmlite'},
+    'python3-pil': {'PIL'},
+    'python3-rosbags-pip': {'rosbags', 'lz4', 'backports'},
+    'ros2launch': {'launch', 'launch_ros'},
+}
+
+
+def test_package_xml_names_all_that_the_package_imports():
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    named = {one.text: one.get('condition') for one in package.findall('exec_depend')}
+    modules = {key: KEYS.get(key, {re.sub('^python3-|-pip$', '', key)}) for key in named}
+    by_pip = {one.text: one.get('extra', '') for one in package.findall('export/pip')}
+    everything = set().union(*modules.values(), by_pip)
+    messages = {
+        match
+        for folder in ('continuum_loc', 'msg_tools')
+        for path in (ROOT / folder).rglob('*.py')
+        for match in re.findall(r"'(\w+)/(?:msg|srv)/", path.read_text())
+    }
+    imported = _imported('continuum_loc', 'msg_tools', 'launch', 'studies')
+    assert imported | messages == everything
+    # What the base does not need is not installed without being asked for.
+    base = {MODULES.get(one, one) for one in _setup()['']} | set(ROS)
+    for key, condition in named.items():
+        assert (condition is None) == (modules[key] <= base), key
+    for module, extra in by_pip.items():
+        assert module in _setup()[extra]
+
+
+def test_pyproject_leaves_the_metadata_to_setup_py():
     assert 'project' not in tomllib.loads((ROOT / 'pyproject.toml').read_text())
 
 
@@ -150,6 +245,31 @@ def test_the_style_is_that_of_ros(command):
         text=True,
     )
     assert done.returncode == 0, done.stdout
+
+
+def test_arrows_run_downward_and_there_are_no_circles():
+    """As the contracts of import-linter in pyproject.toml have it."""
+    done = subprocess.run(
+        [Path(sys.executable).with_name('lint-imports'), '--no-cache'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+    assert '2 kept' in done.stdout
+
+
+def test_every_room_has_its_floor():
+    layers = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['importlinter'][
+        'contracts'
+    ][0]['layers']
+    named = {name.strip() for layer in layers for name in re.split('[|:]', layer)}
+    rooms = {
+        f'continuum_loc.{path.stem}'
+        for path in (ROOT / 'continuum_loc').iterdir()
+        if (path.suffix == '.py' and path.stem != '__init__') or (path / '__init__.py').is_file()
+    }
+    assert named == rooms | {'msg_tools', 'studies', 'bench'}
 
 
 def test_no_slice_has_a_space_before_its_colon():

@@ -80,7 +80,7 @@ def with_one_more(text):
         ('continuum_loc/robot.py', EVERYTHING),
         ('msg_tools/convert.py', EVERYTHING),
         ('continuum_loc/estimator/factors/tof.py', {'replay'} | STUDY),
-        ('continuum_loc/mapping/build.py', {'map', 'replay'} | STUDY),
+        ('continuum_loc/mapping/build.py', {'map', 'scene of a mesh'} | EVERYTHING),
         ('continuum_loc/simulator/world.py', {'recording'} | STUDY),
         ('continuum_loc/simulator/cutting.py', {'recording', 'scene of a mesh'} | STUDY),
         ('continuum_loc/simulator/solids.py', {'recording', 'engine scene', 'scene of a mesh'}),
@@ -205,8 +205,9 @@ def test_no_module_of_a_closure_imports_by_a_name_that_it_computes():
         and ast.unparse(node.func).endswith(('import_module', '__import__'))
     }
     lazy = {name for name, path in modules.items() if f'{HOMES} = ' in path.read_text()}
-    # `studies` loads the study that is asked for by name, which no stored result does.
-    assert dynamic - lazy == {'msg_tools.factory', 'studies'}
+    # `studies` loads the study that is asked for by name, which no stored result does; `extras`
+    # loads what `require` names, which is read as an import.
+    assert dynamic - lazy == {'msg_tools.factory', 'studies', 'continuum_loc.extras'}
     assert lazy == {'continuum_loc.estimator', 'continuum_loc.simulator', 'msg_tools'}
     for package in map(importlib.import_module, lazy):
         assert all(getattr(package, name) for name in vars(package)[HOMES])
@@ -307,9 +308,11 @@ def test_another_version_of_a_library_is_other_code(tmp_path, monkeypatch):
 
 def test_an_import_of_several_names_is_several(tmp_path):
     path = tmp_path / 'a.py'
-    path.write_text('import x.y, z\nfrom . import b, c\nfrom ..d import e as f\n')
+    path.write_text(
+        'import x.y, z\nfrom . import b, c\nfrom ..d import e as f\ng = require("h.i", "maps")\n'
+    )
     found = [(one.module, one.name) for one in imports_of(path, 'p.q.a')]
-    assert found == [('x.y', ''), ('z', ''), ('p.q', 'b'), ('p.q', 'c'), ('p.d', 'e')]
+    assert found == [('x.y', ''), ('z', ''), ('p.q', 'b'), ('p.q', 'c'), ('p.d', 'e'), ('h.i', '')]
 
 
 def test_a_replay_does_not_hang_on_the_number_of_threads():

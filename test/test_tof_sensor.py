@@ -8,11 +8,13 @@ seed change.
 """
 
 from continuum_loc.robot import load_robot, TofModel
+from continuum_loc.simulator.echoes import Echoes
 from continuum_loc.simulator.raycast import cast_capsules, RayCaster
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scenes import load_scene
-from continuum_loc.simulator.tof import Echoes, TofSensorModel
-from continuum_loc.simulator.vl53l5cx import Vl53l5cxReceiver, Vl53l5cxSettings
+from continuum_loc.simulator.tof import TofSensorModel
+from continuum_loc.simulator.vl53l5cx import Vl53l5cxReceiver
+from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import mujoco

@@ -15,6 +15,7 @@ from msg_tools.topics import topic_spec
 from rclpy.qos import DurabilityPolicy
 
 PAGE = Path(__file__).parent / 'viewer.html'
+SCRIPT = PAGE.with_suffix('.js')
 
 
 class ViewerNode(PackageNode):
@@ -49,9 +50,7 @@ class ViewerNode(PackageNode):
             self.get_logger().warning(str(error), throttle_duration_sec=10.0)
 
     def _serve(self) -> Server:
-        from plotly.offline import get_plotlyjs
-
-        answers = answers_of(self.seen, PAGE.read_bytes(), get_plotlyjs().encode())
+        answers = answers_of(self.seen, PAGE.read_bytes(), SCRIPT.read_bytes())
         server = Server(self.settings.host, self.settings.port, answers)
         self.thread(server.serve_forever, 'http').start()
         return server

@@ -11,6 +11,7 @@ from typing import Any
 
 from continuum_loc.errors import BagError
 from continuum_loc.estimator.settings import EstimatorSettings
+from continuum_loc.extras import require_all
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.mapping.scale import map_for
 from continuum_loc.offline.account import account_of
@@ -82,8 +83,10 @@ def evaluate_bags(
     """
     Replay every bag of `folder`; tables, run folders and report go to `out`.
 
-    The one claim is that none failed. Raises BagError or MapError before any work.
+    The one claim is that none failed. Raises BagError, MapError or NotInstalled before
+    any work.
     """
+    require_all('report')  # what writes its tables, asked for before the work
     trials = bag_trials(folder)
     map_for(robot, map_file)  # a map that cannot be used is no bag's fault
     work = [(trial, robot, map_file, settings, out) for trial in trials]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from continuum_loc.estimator.settings import settings_of
+from continuum_loc.extras import require_all
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import TofFrame
 from continuum_loc.offline.account import account_of
@@ -51,6 +52,8 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
     """Run `trial` live into a new folder under `root`, replay its bag twice, write the report."""
     from continuum_loc.offline.live import run_live
 
+    for extra in ('simulate', 'report', 'ros'):
+        require_all(extra)
     robot = load_robot(trial.robot)
     settings = settings_of(robot.name)
     tell('building the scene and its prior map (kept for the next time)')

@@ -11,6 +11,7 @@ import json
 from typing import Any
 
 from continuum_loc.errors import StudyError
+from continuum_loc.extras import require
 from continuum_loc.offline.as_json import plain
 from continuum_loc.offline.replay import one_thread
 
@@ -64,13 +65,9 @@ def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterat
 
     They must see the same files under the same names.
     """
+    distributed = require('distributed', 'cluster')
     try:
-        from distributed import as_completed as as_distributed
-        from distributed import Client
-    except ImportError:
-        raise StudyError('a scheduler needs Dask: pip install distributed') from None
-    try:
-        client = Client(address, timeout=CONNECT_LIMIT)
+        client = distributed.Client(address, timeout=CONNECT_LIMIT)
     except (OSError, TimeoutError, ValueError) as error:
         raise StudyError(
             f'no Dask scheduler at {address} ({error or type(error).__name__})'
@@ -79,7 +76,7 @@ def _distributed(work: Callable, arguments: list[tuple], address: str) -> Iterat
         # The work is seeded, so a cached result would be right; but files are part of it, so
         # nothing is reused.
         futures = [client.submit(_in_worker, work, *each, pure=False) for each in arguments]
-        for future in as_distributed(futures):
+        for future in distributed.as_completed(futures):
             yield future.result()
 
 

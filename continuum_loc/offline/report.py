@@ -6,11 +6,13 @@ What it reached, where it was worst, and a 3-D view to turn.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from continuum_loc.errors import MapError, NotInstalled, SceneError
+from continuum_loc.extras import require_all
 from continuum_loc.measurements import NANOSECONDS
 from continuum_loc.offline import figures
 from continuum_loc.offline.account import account_lines
@@ -86,38 +88,59 @@ class Context:
 
 def write_report(run: Run, context: Context | None = None) -> Path:
     """Write `report.html` into the run's folder and return its path."""
+    require_all('report')
     path = run.folder / 'report.html'
     path.write_text(render(run_page(run, context or Context())))
     return path
 
 
 def context_of(run: Run) -> Context:
-    """Find the scene and the prior map that the run's configuration names, if they still are."""
-    from continuum_loc.errors import MapError, SceneError
-    from continuum_loc.mapping.map_files import load_map
-    from continuum_loc.offline.scene_maps import scene_map
+    """
+    Find the scene and the prior map that the run's configuration names, if they still are.
+
+    A scene is drawn where what simulates is installed. What is not found is said in the report,
+    which stands without it.
+    """
+    mesh, no_mesh = _found(_mesh_of, run)
+    map_points, no_map = _found(_map_points_of, run)
+    return Context(mesh, map_points, missing=' '.join(filter(None, (no_mesh, no_map))))
+
+
+def _found(find: Callable[[Run], Any], run: Run) -> tuple[Any, str]:
+    """Return what is found, or None and why not: it has moved since, or was never here."""
+    try:
+        return find(run), ''
+    except (SceneError, MapError, NotInstalled) as error:
+        return None, str(error)
+
+
+def _mesh_of(run: Run) -> tuple[np.ndarray, np.ndarray] | None:
+    if not run.configuration.get('scene'):
+        return None
+    require_all('simulate')
     from continuum_loc.simulator.scenes import load_scene
 
-    mesh = map_points = None
+    scene = load_scene(run.configuration['scene'])
+    return scene.vertices, scene.faces
+
+
+def _map_points_of(run: Run) -> np.ndarray | None:
+    from continuum_loc.mapping.map_files import load_map
+
     named = run.configuration.get('map') or {}
-    try:
-        if run.configuration.get('scene'):
-            scene = load_scene(run.configuration['scene'])
-            mesh = (scene.vertices, scene.faces)
-        if 'file' in named:
-            map_points = load_map(named['file']).points
-        elif 'scene' in named:
-            map_points = scene_map(named['scene']).points
-    except (
-        SceneError,
-        MapError,
-    ) as error:  # moved since: the report says so, and stands without it
-        return Context(mesh, map_points, missing=str(error))
-    return Context(mesh, map_points)
+    if 'file' in named:
+        return load_map(named['file']).points
+    if 'scene' not in named:
+        return None
+    require_all('simulate')
+    from continuum_loc.offline.scene_maps import scene_map
+
+    return scene_map(named['scene']).points
 
 
 def render(page: Page) -> str:
     """Render the page as HTML, with plotly's script inside, so that it needs no network."""
+    require_all('report')
     from jinja2 import Environment, PackageLoader
     from plotly.offline import get_plotlyjs
 

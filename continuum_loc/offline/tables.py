@@ -7,6 +7,8 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from continuum_loc.extras import require
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -29,7 +31,7 @@ LATEX_SPECIAL = str.maketrans(
 
 def write_table(table: pd.DataFrame | Sequence[Mapping[str, Any]], stem: Path) -> None:
     """Write `stem`.csv, .json, .md and .tex. `table` is a DataFrame or a list of rows."""
-    import pandas as pd
+    pd = require('pandas', 'report')
 
     frame = table if isinstance(table, pd.DataFrame) else pd.DataFrame(list(table))
     stem.parent.mkdir(parents=True, exist_ok=True)

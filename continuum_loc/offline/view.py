@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from continuum_loc.extras import require
 from continuum_loc.measurements import NANOSECONDS
 from continuum_loc.offline.replay import Cloud, ReplayResult
 from continuum_loc.trajectory import Trajectory
@@ -135,8 +136,7 @@ def clipped(
     vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clip the mesh to an axis-aligned box, its faces cut at the box's sides."""
-    from trimesh.intersections import slice_faces_plane
-
+    slice_faces_plane = require('trimesh.intersections', 'simulate').slice_faces_plane
     vertices, faces = np.array(vertices), np.array(faces)
     low, high = np.clip(low, -1e6, 1e6), np.clip(high, -1e6, 1e6)  # planes need finite points
     for axis in range(3):
@@ -149,7 +149,7 @@ def thinned(
     vertices: np.ndarray, faces: np.ndarray, most_faces: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thin the mesh to at most about `most_faces` faces, by quadric decimation."""
-    import open3d as o3d
+    o3d = require('open3d', 'simulate')
 
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces.astype(np.int32))

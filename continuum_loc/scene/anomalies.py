@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from typing import get_args, Literal, NamedTuple
 
 from continuum_loc.errors import MapError
+from continuum_loc.extras import require
 from continuum_loc.mapping.build import DENSITY
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.scene.free_space import passes
@@ -511,7 +512,7 @@ def beams_on(truth: Truth, reconstruction: Reconstruction) -> int:
     """
     if truth.kind not in get_args(Kind):
         raise MapError(f"an anomaly is added or missing, not '{truth.kind}'")
-    import open3d
+    open3d = require('open3d', 'simulate')
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(np.asarray(truth.vertices, np.float32), np.asarray(truth.faces, np.uint32))

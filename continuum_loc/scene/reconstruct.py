@@ -14,6 +14,7 @@ from typing import NamedTuple
 from continuum_loc import lie
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
+from continuum_loc.extras import require
 from continuum_loc.mapping.ply import write_ply
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from continuum_loc.robot import RobotDescription
@@ -294,7 +295,7 @@ def _point_covariance(
 
 def distances_to_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(N,) unsigned distance [m] of points (N, 3) to a triangle mesh (V, 3), (F, 3)."""
-    import open3d
+    open3d = require('open3d', 'simulate')
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(np.asarray(vertices, np.float32), np.asarray(faces, np.uint32))

@@ -17,6 +17,7 @@ import sys
 import tempfile
 
 from continuum_loc.errors import SceneError
+from continuum_loc.extras import require
 import numpy as np
 
 SMALL = 2000  # faces that CoACD gets done within tens of seconds
@@ -95,7 +96,7 @@ def _run(module: str, *arguments: object) -> subprocess.CompletedProcess:
 
 
 def _decompose(source: str, result: str) -> None:
-    import coacd
+    coacd = require('coacd', 'simulate')
 
     coacd.set_log_level('error')
     with np.load(source) as mesh:

@@ -25,7 +25,7 @@ from continuum_loc.simulator.departing_sensors import (
 )
 from continuum_loc.simulator.faults import ClockOffset, Fault, miscalibrated
 from continuum_loc.simulator.plant import PlantSettings
-from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
+from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from continuum_loc.errors import MapError, SceneError
+from continuum_loc.extras import require
 from continuum_loc.mapping.formats.shapes import Cloud
 from continuum_loc.mapping.map_files import read_shape
 from continuum_loc.simulator.convex import convex_pieces
@@ -60,7 +61,7 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
 
 
 def _load(path: Path):
-    import trimesh
+    trimesh = require('trimesh', 'simulate')
 
     if path.is_dir():
         raise SceneError(f'{path}: a folder, not a mesh file')

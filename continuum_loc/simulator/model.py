@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from continuum_loc.errors import SettingsError, SimulationDiverged
+from continuum_loc.extras import require
 from continuum_loc.robot import Ring, RobotDescription
 from continuum_loc.simulator.plant import node_arclengths, PlantSettings, Profile
 import numpy as np
@@ -57,7 +58,7 @@ def build_spec(
     `scene` gives the convex pieces to collide with, None the empty space; `supported` lets
     something else carry the rod's weight.
     """
-    import mujoco
+    mujoco = require('mujoco', 'simulate')
 
     chosen = plant.profile(profile)
     spec = mujoco.MjSpec()
@@ -234,7 +235,7 @@ def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
 
     On its insertion slide where the base can travel.
     """
-    import mujoco
+    mujoco = require('mujoco', 'simulate')
 
     quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
     carriage = spec.worldbody.add_body(name='carriage', pos=robot.base.xyz, quat=quat)

@@ -7,6 +7,7 @@ The scene by Embree (through Open3D), the robot's own body as capsules by a comp
 from __future__ import annotations
 
 from continuum_loc.compiling import kernel
+from continuum_loc.extras import require
 from continuum_loc.simulator.scene import Scene
 import numpy as np
 
@@ -17,7 +18,7 @@ class RayCaster:
     """Casts rays against a scene's mesh. Single precision inside: about 1e-7 of the distance."""
 
     def __init__(self, scene: Scene, threads: int = 1) -> None:
-        import open3d
+        open3d = require('open3d', 'simulate')
 
         self.scene = scene
         self._tensor = open3d.core.Tensor

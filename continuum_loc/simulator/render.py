@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 import sys
 
+from continuum_loc.extras import require
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scenes import load_scene
@@ -101,7 +102,7 @@ def render(shapes: list[Shape], camera: Camera, daylight: int = 0) -> np.ndarray
     daylight: rays per sample that ask how much of the sky within `DAYLIGHT_REACH` each surface
     sees, which shades corners; 0 leaves all surfaces in even light, and is quick.
     """
-    import open3d as o3d
+    o3d = require('open3d', 'simulate')
 
     caster = o3d.t.geometry.RaycastingScene()
     for shape in shapes:
@@ -172,7 +173,7 @@ def scene_shapes(scene: Scene) -> list[Shape]:
 
 def _daylight(caster, points: np.ndarray, normals: np.ndarray, rays: int) -> np.ndarray:
     """(H, W) share of the sky above each surface that nothing within `DAYLIGHT_REACH` hides."""
-    import open3d as o3d
+    o3d = require('open3d', 'simulate')
 
     rng, free = np.random.default_rng(0), np.zeros(points.shape[:2])
     for _ in range(rays):
@@ -215,7 +216,7 @@ def _tube(T_map_section: np.ndarray, radius: float, colour: tuple[float, float, 
 
 
 def _box(T_map_box: np.ndarray, half: float, colour: tuple[float, float, float]) -> Shape:
-    import trimesh
+    trimesh = require('trimesh', 'simulate')
 
     box = trimesh.creation.box((half, 2.0 * half, 2.0 * half), transform=T_map_box)
     return Shape(np.asarray(box.vertices), np.asarray(box.faces), colour)

@@ -9,62 +9,21 @@ measured distance; and `vl53l5cx`, which also reproduces what the real sensor do
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import get_args, Literal, Protocol, TYPE_CHECKING
+from typing import get_args, Literal, TYPE_CHECKING
 
 from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID, TofFrame
 from continuum_loc.robot import TofModel
+from continuum_loc.simulator.echoes import Echoes, Readings, Receiver, TOF_TOO_CLOSE
 from continuum_loc.simulator.raycast import cast_capsules, RayCaster
 import numpy as np
 
 if TYPE_CHECKING:
-    from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
+    from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 
-TOF_TOO_CLOSE = 4  # a consistency failure
 Fidelity = Literal['paper', 'vl53l5cx']
 
 # The body's black plastic, and the mean cosine at which rays meet a cylinder seen broadside.
 _BODY_REFLECTANCE = 0.3 * np.pi / 4.0
-
-
-@dataclass(frozen=True, eq=False)
-class Echoes:
-    """
-    What K rays of S sensors meet.
-
-    Distance (S, K) along the ray [m], inf where nothing; and the share of light that comes back
-    (S, K), reflectance times cosine of incidence.
-    """
-
-    distance: np.ndarray
-    brightness: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """
-    Per sensor and zone (S, Z), as in `TofFrame`: ranges [m], stated sigma [m], status.
-
-    raw: (S, Z) distance in the driver's registers [m], where the receiver has such; no frame
-    carries it.
-    """
-
-    ranges: np.ndarray
-    sigma: np.ndarray
-    status: np.ndarray
-    raw: np.ndarray | None = None
-
-
-class Receiver(Protocol):
-    """
-    Turns echoes into readings.
-
-    `directions` (K, 3) are the rays that it needs, in the sensor frame.
-    """
-
-    directions: np.ndarray
-
-    def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings: ...
 
 
 class TofSensorModel:

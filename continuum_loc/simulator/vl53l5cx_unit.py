@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
+    from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 
 
 @dataclass(eq=False)

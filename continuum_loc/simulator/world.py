@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from continuum_loc.simulator.readout import Readout
     from continuum_loc.simulator.scene import Scene
     from continuum_loc.simulator.tof import TofSensorModel
-    from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
+    from continuum_loc.simulator.vl53l5cx_settings import Vl53l5cxSettings
 
 TRUTH_RATE = 100.0
 ENCODER_RATE = 50.0

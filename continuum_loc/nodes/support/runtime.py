@@ -16,6 +16,7 @@ from typing import Any
 from weakref import WeakSet
 
 from continuum_loc.errors import ContinuumLocError, SettingsError
+from continuum_loc.extras import explained
 from continuum_loc.nodes.support.parameters import (
     check_arguments,
     declare,
@@ -266,6 +267,8 @@ def _ignore_signals() -> None:
 
 def _complain(error: Exception) -> int:
     """One clear line for what the user can mend; the traceback for what only we can."""
+    if isinstance(error, ModuleNotFoundError):
+        error = explained(error)
     if isinstance(error, ContinuumLocError):
         print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT

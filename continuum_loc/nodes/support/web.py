@@ -114,7 +114,7 @@ def answers_of(seen: Seen, page: bytes, script: bytes) -> Answers:
     """List what the server has: the page, its script, and what was seen."""
     return {
         '/': ('text/html', lambda: page),
-        '/plotly.js': ('text/javascript', lambda: script),
+        '/viewer.js': ('text/javascript', lambda: script),
         '/state.json': ('application/json', lambda: json.dumps(seen.state()).encode()),
         '/map.json': ('application/json', lambda: json.dumps(seen.newest['map']).encode()),
     }

@@ -22,9 +22,9 @@ from continuum_loc.offline.claims import Claim
 from continuum_loc.offline.trials import Trial
 from studies.support.split import DETECTOR_HOLD_OUT, HOLD_OUT
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 LOG = ROOT / 'docs' / 'reported.md'
-CHECKSUMS = Path(__file__).parent / 'sets.sha256'
+CHECKSUMS = Path(__file__).parent / 'support' / 'sets.sha256'
 REPORTED = (
     'table2',
     'table3',
