@@ -16,7 +16,9 @@ from time import process_time
 
 from bench.harness import one_core
 from continuum_loc.estimator.settings import load_estimator_settings
-from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from matplotlib.figure import Figure
 
@@ -29,9 +31,9 @@ PARTS = {
     'ToF: matching and information': [('tof.py', '_add')],
     'strain': [('factors/strain.py', '_add')],
     'gyro': [('factors/gyro.py', '_add')],
-    'priors': [('priors.py', f'_add_{of}') for of in ('time', 'space', 'base', 'bias')],
+    'priors': [('priors.py', '_add')],
     'elimination, solves, covariances': [('chain.py', ANY)],
-    'ToF: reading frames': [('tof.py', 'row'), ('tof.py', '_beams')],
+    'ToF: reading frames': [('tof.py', 'row'), ('tof.py', '_read')],
     'stacking of batches': [('tof.py', 'stack'), ('strain.py', 'stack'), ('gyro.py', 'stack')],
 }
 

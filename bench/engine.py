@@ -17,7 +17,9 @@ from time import perf_counter, process_time
 from bench.harness import alone, one_core
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.measurements import Measurement, seconds
-from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 import numpy as np
 

@@ -1,9 +1,8 @@
 """
 Benchmarks: ours beside what one would use instead, as ratios with spread.
 
-A baseline of ratios is committed.
-
-A benchmark NAME is a file `bench/NAME.py` of the source tree with `run(quick: bool) ->
+The ratios of a quiet day are committed as the baseline of later runs. A benchmark NAME is a file
+`bench/NAME.py` of the source tree with `run(quick: bool) ->
 list[dict]`. Each row has `name`, `ours_s`, `peer`, `peer_s`, `ratio` (peer over ours, the median
 over interleaved repeats) and `spread` (the ratio's quartiles); a row without a peer has None in
 the last four. `side_by_side` and `alone` make such rows; `exponent` and `memory_bytes` are shown

@@ -23,7 +23,7 @@ def run(quick: bool = False) -> list[dict]:
     """Rows of name and ours_s; `rate_hz` where a row is about messages."""
     from bench.harness import alone
     from continuum_loc.offline.live import run_live
-    from continuum_loc.offline.trials import scene_map_file
+    from continuum_loc.offline.scene_maps import scene_map_file
     from studies.support.footprint import Footprint
 
     footprint = Footprint(period=0.5)

@@ -1,7 +1,5 @@
 """
-One frame of ToF rays against an engine of 150,000 faces.
-
-Beside MuJoCo's own ray casters and Open3D.
+One frame of ToF rays against 150,000 faces, beside MuJoCo's ray casters and Open3D.
 
 `run(quick)` gives a list of rows, each ours against one peer on one workload, on one core,
 alternating the two:
@@ -29,11 +27,7 @@ Action = Callable[[], object]
 
 
 def run(quick: bool = False) -> list[dict]:
-    """
-    Rows of name, ours_s, peer, peer_s, ratio (peer / ours) and spread (its quartiles).
-
-    Times are seconds per frame.
-    """
+    """Rows as `bench.harness` describes them; times are seconds per frame."""
     scene = engine_scene()
     caster, model, data = RayCaster(scene), *_mujoco_scene(scene)
     frame, repeats, rows = _fans(1), 2 if quick else 10, []

@@ -1,7 +1,5 @@
 """
-One step of the filter on a recorded trial, beside the published figure.
-
-5 nodes and 4 knots, covariance included.
+One step of the filter on a recorded trial (5 nodes, 4 knots, covariance included).
 
 The trial is found through CONTINUUM_LOC_DATA; without it there are no rows. The published C++
 code's 20 ms (19-21) are its authors' figure from another machine, so there is no ratio against it,

@@ -25,7 +25,8 @@ from continuum_loc.mapping.facing import PATIENCE
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import Measurement, NANOSECONDS, TofFrame
-from continuum_loc.offline.trials import measured, scene_map, Trial
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np
@@ -123,7 +124,7 @@ def _maps(samples: list[Measurement], settings: EstimatorSettings, quick: bool) 
     for points in MAPS[:2] if quick else MAPS:
         prior = _random_map(points)
         filter_, seconds = _step(samples, prior, settings)
-        index = filter_.tof.index
+        index = filter_.setup.index
         steps.append((points, seconds))
         lookups.append((points, _lookup(prior, index)))
         memory.append(sum(a.nbytes for a in index.arrays if isinstance(a, np.ndarray)))

@@ -1,9 +1,8 @@
 """
 What one waits for before anything happens: import, help, the first estimate, a node.
 
-Fresh processes, on one core.
-
-Kernels are compiled on the first run on a machine and kept; these rows have them kept. `ours_s` is
+Each is a fresh process on one core. Kernels are compiled on the first run on a machine and kept;
+these rows have them kept. `ours_s` is
 the processor time of the process, `wall_s` what the clock on the wall said meanwhile (more, where
 the machine is shared), `memory_bytes` the greatest resident size by then. The node is the
 estimator with the engine robot and its map, from its start until its log says `ready`: imports,
@@ -21,7 +20,8 @@ import tempfile
 import time
 
 from bench.harness import alone, one_core
-from continuum_loc.offline.trials import scene_map, simulate, Trial, write_bag
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import simulate, Trial, write_bag
 import numpy as np
 
 BOUNDS = [
@@ -30,7 +30,9 @@ BOUNDS = [
 ]
 
 _ESTIMATE = """
-from continuum_loc.offline.trials import Trial, make_filter, scene_map
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import Trial
 from continuum_loc.offline.replay import samples_of
 from continuum_loc.measurements import TruthSample
 from continuum_loc.robot import load_robot

@@ -19,14 +19,18 @@ checked:
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 from bench.harness import one_core, seconds_of, side_by_side
 from continuum_loc import lie, lie_kernels
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.chain import Blocks, Chain, Message, symmetric
+from continuum_loc.estimator.chain import Chain
+from continuum_loc.estimator.normal import gather, new_normal, Normal, symmetric
 from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.estimator.state import NODE_DIM
-from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.localise import make_filter
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from numba import njit
 import numpy as np
@@ -51,7 +55,7 @@ def run(quick: bool = False) -> list[dict]:
 
 def _window_rows(repeats: int) -> list[dict]:
     start, blocks, nodes = _engine_window()
-    dim, last = len(start.gradient), len(blocks)
+    dim, last = len(start.g), len(blocks)
     newest = np.eye(dim, order='F')
 
     def solve() -> list[np.ndarray]:
@@ -80,16 +84,16 @@ def _window_rows(repeats: int) -> list[dict]:
     ]
 
 
-def _engine_window() -> tuple[Message, list[Blocks], int]:
-    """Start message and normal equations of the engine robot's window; its number of nodes."""
+def _engine_window() -> tuple[Normal, list[Normal], int]:
+    """Start and normal equations of the engine robot's window; its number of nodes."""
     settings = load_estimator_settings('engine')
     estimator = make_filter(load_robot('engine'), scene_map('S0'), settings)
     for sample in measured(Trial('engine', 'S0', 't2', duration=3.0)):
         estimator.process(sample)
     window = estimator.window
     return (
-        window.chain.messages[0],
-        [interval.blocks for interval in window.intervals],
+        window.chain.marginals[0],
+        [interval.normal for interval in window.intervals],
         estimator.grid.nodes,
     )
 
@@ -102,7 +106,7 @@ def _per_node(nodes: int, dim: int) -> list[int]:
 class _Gtsam:
     """The same quadratic as HessianFactors, each column split into variables at `bounds`."""
 
-    def __init__(self, start: Message, blocks: list[Blocks], bounds: list[int]):
+    def __init__(self, start: Normal, blocks: list[Normal], bounds: list[int]):
         import gtsam
 
         self._gtsam = gtsam
@@ -110,7 +114,7 @@ class _Gtsam:
         self._graph = gtsam.GaussianFactorGraph()
         self._columns = len(blocks) + 1
         pieces = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-        self._add(symmetric(start.information), start.gradient, 0, pieces)
+        self._add(symmetric(start.H), start.g, 0, pieces)
         for k, block in enumerate(blocks):
             dim = bounds[-1]
             both = pieces + [slice(piece.start + dim, piece.stop + dim) for piece in pieces]
@@ -214,54 +218,49 @@ def _gauss_newton(times, measured, information, guess, period, psd) -> np.ndarra
     T, v = guess.copy(), np.zeros((KNOTS, 6))
     start_T = guess[0].copy()
     knot = np.minimum((times / period).astype(np.int64), KNOTS - 2)
+    frames = Frames(times - knot * period, knot, measured, information)
     H, g = np.empty((KNOTS - 1, 2 * BODY, 2 * BODY)), np.empty((KNOTS - 1, 2 * BODY))
+    normal, work = Normal(H, g), gp.new_workspace()
     for _ in range(ITERATIONS):
-        _linearise(T, v, times - knot * period, knot, measured, information, period, 1 / psd, H, g)
+        _linearise(T, v, period, 1 / psd, frames, normal, work)
         e = lie.log(lie.inverse(start_T) @ T[0])
         J = lie.right_jacobian_inverse(e)
-        first = Message(np.eye(BODY), np.concatenate([J.T @ e, v[0]]))
-        first.information[:6, :6] = J.T @ J
+        first = Normal(np.eye(BODY), np.concatenate([J.T @ e, v[0]]))
+        first.H[:6, :6] = J.T @ J
         chain = Chain(BODY, first)
-        offsets = np.array(chain.solve([Blocks(h, b) for h, b in zip(H, g, strict=True)], 0))
+        offsets = np.array(chain.solve([Normal(h, b) for h, b in zip(H, g, strict=True)], 0))
         T, v = T @ lie.exp(offsets[:, :6]), v + offsets[:, 6:]
     return T
 
 
+class Frames(NamedTuple):
+    """Times after the knot before, that knot, poses (F, 4, 4) and informations (F, 6, 6)."""
+
+    tau: np.ndarray
+    knot: np.ndarray
+    T: np.ndarray
+    information: np.ndarray
+
+
 @njit  # not cached: numba would not see that a kernel of the library has changed
-def _linearise(T, v, tau, knot, measured, information, period, q_inverse, H, g):
-    W, V, M = lie_kernels.workspace()
-    J_work, index, work = np.empty((2, 6, 24)), np.arange(24), np.empty((6, 24))
+def _linearise(T, v, period, q_inverse, frames, normal, work):
+    index, product, local = np.arange(24), np.empty((6, 24)), new_normal(6)
     e, J = np.empty(12), np.empty((12, 24))
-    T_now, v_now = np.empty((4, 4)), np.empty(6)
-    J_pose, J_rate = np.empty((6, 24)), np.empty((6, 24))
-    H_body, g_body = np.empty((6, 6)), np.empty(6)
-    residual, J_log = np.empty(6), np.empty((6, 6))
-    H[:] = 0.0
-    g[:] = 0.0
-    for k in range(H.shape[0]):
-        gp.motion_error(T[k], v[k], T[k + 1], v[k + 1], period, e, J, W, V, M)
-        gp.add_motion(H[k], g[k], index, e, J, period, q_inverse)
-    for f in range(tau.shape[0]):
-        k = knot[f]
-        gp.hermite(
-            T[k], v[k], T[k + 1], v[k + 1], period, tau[f],
-            T_now, v_now, J_pose, J_rate, W, V, M, J_work,
-        )  # fmt: skip
-        _pose_error(measured[f], T_now, residual, J_log, W, V, M)
-        weighted = J_log.T @ information[f]
-        H_body[:] = weighted @ J_log
-        g_body[:] = weighted @ residual
-        gp.gather(H[k], g[k], H_body, g_body, J_pose, work)
-
-
-@njit
-def _pose_error(measured, T, residual, J, W, V, M):
-    """Residual (6,) = Log(measured^-1 T) and its Jacobian by a right perturbation of T."""
-    lie_kernels.relative(measured, T, M[0])
-    lie_kernels.log(M[0], residual)
-    lie_kernels.ad(residual, W[0])
-    lie_kernels.right_inverse_coefficients(residual, V[1], V[2])
-    lie_kernels.polynomial(V[1], W[0], J, W[1:3])
+    normal.H[:] = 0.0
+    normal.g[:] = 0.0
+    for k in range(normal.g.shape[0]):
+        gp.motion_error(gp.Ends(T[k], v[k], T[k + 1], v[k + 1], period), e, J, work)
+        gp.add_motion(Normal(normal.H[k], normal.g[k]), index, e, J, period, q_inverse)
+    for f in range(frames.tau.shape[0]):
+        k, at = frames.knot[f], work[0]
+        gp.relate(gp.Ends(T[k], v[k], T[k + 1], v[k + 1], period), work)
+        gp.evaluate(work, frames.tau[f], True, 0)
+        error, J_log = at.gamma, at.right_gamma
+        lie_kernels.pose_error(frames.T[f], at.T, error, J_log, at.scratch)
+        weighted = J_log.T @ frames.information[f]
+        local.H[:] = weighted @ J_log
+        local.g[:] = weighted @ error.x
+        gather(Normal(normal.H[k], normal.g[k]), local, at.J_pose, product)
 
 
 def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[], np.ndarray]:
@@ -270,14 +269,15 @@ def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[
 
     swap = np.array([3, 4, 5, 0, 1, 2])
     pose, rate = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V
-    W, V, M = lie_kernels.workspace()
-    J_work, e, J = np.empty((2, 6, 24)), np.empty(12), np.empty((12, 24))
-    T_now, v_now = np.empty((4, 4)), np.empty(6)
-    J_pose, J_rate = np.empty((6, 24)), np.empty((6, 24))
-    residual, J_log = np.empty(6), np.empty((6, 6))
+    work, e, J = gp.new_workspace(), np.empty(12), np.empty((12, 24))
+    at = work[0]
 
-    def state(values, k: int):
-        return values.atPose3(pose(k)).matrix(), values.atVector(rate(k))
+    def ends(values, k: int) -> gp.Ends:
+        T, v = (
+            [one(key(k + i)) for i in range(2)]
+            for one, key in ((values.atPose3, pose), (values.atVector, rate))
+        )
+        return gp.Ends(T[0].matrix(), v[0], T[1].matrix(), v[1], period)
 
     def share(J_all: np.ndarray, jacobians) -> None:
         """By [pose, rate] of two knots, in gtsam's order of a pose's tangent."""
@@ -286,7 +286,7 @@ def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[
 
     def motion(k: int):
         def error(_, values, jacobians):
-            gp.motion_error(*state(values, k), *state(values, k + 1), period, e, J, W, V, M)
+            gp.motion_error(ends(values, k), e, J, work)
             if jacobians is not None:
                 share(J, jacobians)
             return e.copy()
@@ -295,14 +295,14 @@ def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[
 
     def frame(f: int, k: int, tau: float):
         def error(_, values, jacobians):
-            gp.hermite(
-                *state(values, k), *state(values, k + 1), period, tau,
-                T_now, v_now, J_pose, J_rate, W, V, M, J_work,
-            )  # fmt: skip
-            _pose_error(measured[f], T_now, residual, J_log, W, V, M)
+            gp.relate(ends(values, k), work)
+            gp.evaluate(work, tau, True, 0)
+            lie_kernels.pose_error(
+                measured[f], at['T'], at['gamma'], at['right_gamma'], at['scratch']
+            )
             if jacobians is not None:
-                share(J_log @ J_pose, jacobians)
-            return residual.copy()
+                share(at['right_gamma'] @ at['J_pose'], jacobians)
+            return at['gamma']['x'].copy()
 
         return error
 

@@ -4,17 +4,21 @@ The command line `continuum-loc`.
 Each command reads its arguments and calls the library; work is done there. It imports what it
 needs itself, so that `--help` takes a tenth of a second.
 
-Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input.
+Exit codes: 0 done, 1 a claim or a comparison failed, 2 wrong usage or input, or input of which
+nothing, or no measurement of a whole kind of sensor, could be used.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 import json
 from pathlib import Path
+import shutil
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
-from continuum_loc.errors import ContinuumLocError, InputError, StudyError
+from continuum_loc.errors import ContinuumLocError, InputError, MapError, StudyError
 from rich.console import Console
 from rich.markup import escape
 import typer
@@ -47,14 +51,17 @@ Robot = Annotated[
 Scene = Annotated[
     str, typer.Option(help='`S0`-`S9`, `R0`-`R4`, or your own mesh (STL, OBJ, PLY; metres)')
 ]
-MapFile = Annotated[
-    Path | None, typer.Option('--map', help='prior map: .npz .ply .pcd .xyz .csv, or a mesh')
-]
+MapFile = Annotated[Path | None, typer.Option('--map', help='prior map: .npz, a cloud or a mesh')]
 Seed = Annotated[int, typer.Option(help='seed of everything random')]
 Runs = Annotated[Path, typer.Option('--out', help='folder of the numbered runs')]
 Settings = Annotated[
     Path | None, typer.Option(help='estimator settings (YAML); default: those of the robot')
 ]
+Namespace = Annotated[
+    str, typer.Option(help='whose topics, where the bag holds several robots; `/` for none')
+]
+Prefix = Annotated[str, typer.Option(help="what stands before the robot's frame names in the bag")]
+Strict = Annotated[bool, typer.Option('--strict', help='end at the first unusable message')]
 
 
 def main() -> None:
@@ -91,10 +98,7 @@ def demo(
         outcome = run_demo(
             Trial(robot, scene, trajectory, seed=seed, duration=duration), out, status.update
         )
-    console.print(_run_table(outcome.summary))
-    console.print(
-        f'report  [link=file://{outcome.folder}/report.html]{outcome.folder}/report.html[/link]'
-    )
+    unusable = _tell(outcome.folder, outcome.summary)
     console.print(f'bag     {outcome.bag}')
     for claim in outcome.claims:
         if not claim.holds:  # a slow machine is no failure of the demo; two different replays are
@@ -108,6 +112,7 @@ def demo(
     console.print(
         'replay  two replays of the bag without ROS gave the same estimate, to the last bit'
     )
+    raise typer.Exit(USAGE if unusable else OK)
 
 
 @app.command()
@@ -128,6 +133,14 @@ def simulate(
         str, typer.Option(help="`full`: the paper's fine links; `live`: fewer")
     ] = 'full',
     fidelity: Annotated[str, typer.Option(help='ToF model: `paper` or `vl53l5cx`')] = 'paper',
+    world_name: Annotated[
+        str,
+        typer.Option(
+            '--world',
+            help='`ideal`, `disturbed`, or true departures of your own (YAML); '
+            '`disturbed:mounts+base` takes parts alone',
+        ),
+    ] = 'ideal',
     duration: Annotated[
         float | None, typer.Option(help='seconds; default: the whole trajectory')
     ] = None,
@@ -138,6 +151,7 @@ def simulate(
 
     Example: `continuum-loc simulate /tmp/trial --scene S3 --trajectory t2 --seed 4`
     """
+    from continuum_loc.offline.trial_runs import trial_map_file
     from continuum_loc.offline.trials import Trial, world, write_bag
 
     trial = Trial(
@@ -149,6 +163,7 @@ def simulate(
         fidelity=fidelity,
         seed=seed,
         duration=duration,
+        world=world_name,
     )
     with _busy() as status:
         status.update('building the scene and letting the robot come to rest')
@@ -156,6 +171,10 @@ def simulate(
     seconds = made.trajectory.duration if duration is None else duration
     counts = write_bag(bag, _progress(made.run(duration), 'simulating', seconds))
     _count_table(counts, f'{bag}: {seconds:g} s')
+    if made.scene is not None and trial.departures.map_departs:
+        prior_map = bag.with_name(f'{bag.name}_map.npz')
+        shutil.copyfile(trial_map_file(trial), prior_map)
+        console.print(f'prior map as it was scanned: {prior_map}', highlight=False)
 
 
 @app.command('import-trial')
@@ -183,55 +202,67 @@ def replay(
     robot: Robot = 'engine',
     map_file: MapFile = None,
     scene: Annotated[
-        str,
-        typer.Option(
-            help='scene shown in the report, and whose map is taken where `--map` is not given'
-        ),
-    ] = 'S0',
+        str | None,
+        typer.Option(help='scene that is shown in the report, and whose map replaces `--map`'),
+    ] = None,
     settings: Settings = None,
+    namespace: Namespace = '',
+    frame_prefix: Prefix = '',
+    strict: Strict = False,
     seed: Seed = 0,
     out: Runs = Path('runs'),
 ) -> None:
     """
     Localise from a recorded bag without a ROS graph.
 
-    The same bag gives the same estimate, bit for bit.
+    The same bag gives the same estimate, bit for bit. What cannot be used of it is counted and
+    told at the end, and the rest is used.
 
     Example: `continuum-loc replay runs/latest/bag --map my_map.ply --robot my_robot.yaml`
     """
     from continuum_loc.estimator import settings_of
-    from continuum_loc.mapping.map_files import load_map
+    from continuum_loc.mapping.scale import map_for
+    from continuum_loc.offline.localise import make_filter
     from continuum_loc.offline.replay import replay as run_replay
-    from continuum_loc.offline.replay import samples_of
     from continuum_loc.offline.runs import new_run, save_run
-    from continuum_loc.offline.trials import make_filter, scene_map_file
+    from continuum_loc.offline.scene_maps import scene_map_file
     from continuum_loc.robot import load_robot
 
-    description = load_robot(robot)
+    description, duration = load_robot(robot), _bag_duration(bag)
+    chosen = settings_of(description.name, settings)
+    if map_file is None and scene is None and description.tof and chosen.tof.enabled:
+        raise MapError(
+            f"robot '{description.name}' has ToF sensors, which need a prior map: give `--map "
+            'FILE`, or `--scene NAME` for the map of a scene of the simulator'
+        )
     with _busy() as status:
         status.update('loading the prior map')
-        map_file = map_file or scene_map_file(scene)
-        estimator = make_filter(
-            description, load_map(map_file), settings_of(description.name, settings)
+        if map_file is None and scene is not None:
+            map_file = scene_map_file(scene)
+        prior = None if map_file is None else map_for(description, map_file)
+        estimator = make_filter(description, prior, chosen)
+    if prior is not None:
+        _say(map_file, prior.notes)
+    with _bar('replaying', duration) as progress:
+        result = run_replay(
+            bag,
+            estimator,
+            namespace=namespace,
+            frame_prefix=frame_prefix,
+            strict=strict,
+            progress=progress,
         )
-    result = run_replay(_progress(samples_of(bag), 'replaying', _bag_duration(bag)), estimator)
+    configuration = {
+        'robot': description,
+        'bag': bag,
+        'map': {} if map_file is None else {'file': map_file},
+        'scene': scene,
+        'estimator': estimator.settings,
+    }
     folder = new_run('replay', out)
-    summary = save_run(
-        folder,
-        result,
-        kind='replay',
-        seed=seed,
-        configuration={
-            'robot': description,
-            'bag': bag,
-            'map': {'file': map_file},
-            'scene': scene,
-            'estimator': estimator.settings,
-        },
-    )
+    summary = save_run(folder, result, kind='replay', seed=seed, configuration=configuration)
     _write_report(folder)
-    console.print(_run_table(summary))
-    console.print(f'report  {folder}/report.html')
+    raise typer.Exit(USAGE if _tell(folder, summary) else OK)
 
 
 @app.command()
@@ -241,6 +272,9 @@ def shape(
     settings: Annotated[
         Path | None, typer.Option(help="shape settings (YAML); default: the package's")
     ] = None,
+    namespace: Namespace = '',
+    frame_prefix: Prefix = '',
+    strict: Strict = False,
     out: Runs = Path('runs'),
 ) -> None:
     """
@@ -251,7 +285,6 @@ def shape(
     Example: `continuum-loc shape bench_top.mcap --robot my_arm.yaml`
     """
     from continuum_loc.offline.replay import replay as run_replay
-    from continuum_loc.offline.replay import samples_of
     from continuum_loc.offline.runs import new_run, save_run
     from continuum_loc.offline.shape_replay import ShapeReplay
     from continuum_loc.robot import load_robot
@@ -259,18 +292,46 @@ def shape(
 
     description = load_robot(robot)
     estimator = ShapeReplay(description, load_shape_settings(settings))
-    result = run_replay(_progress(samples_of(bag), 'estimating', _bag_duration(bag)), estimator)
+    with _bar('estimating', _bag_duration(bag)) as progress:
+        result = run_replay(
+            bag,
+            estimator,
+            namespace=namespace,
+            frame_prefix=frame_prefix,
+            strict=strict,
+            progress=progress,
+        )
+    configuration = {'robot': description, 'bag': bag, 'estimator': estimator.settings}
     folder = new_run('shape', out)
-    summary = save_run(
-        folder,
-        result,
-        kind='shape',
-        seed=None,
-        configuration={'robot': description, 'bag': bag, 'estimator': estimator.settings},
-    )
+    summary = save_run(folder, result, kind='shape', seed=None, configuration=configuration)
     _write_report(folder)
-    console.print(_run_table(summary))
-    console.print(f'report  {folder}/report.html')
+    raise typer.Exit(USAGE if _tell(folder, summary) else OK)
+
+
+@app.command()
+def repair(
+    bag: Annotated[Path, typer.Argument(help='bag folder or file that cannot be read')],
+    out: Annotated[
+        Path | None, typer.Argument(help='new bag folder; default: `BAG_repaired`')
+    ] = None,
+) -> None:
+    """
+    Save what is whole of a bag that was cut off: its recorder was killed, or its disk was full.
+
+    The bag itself stays as it is.
+
+    Example: `continuum-loc repair bag_20260101_120000`
+    """
+    from continuum_loc.offline.repair import repair as save_whole
+
+    out = out or bag.with_name(f'{bag.stem if bag.is_file() else bag.name}_repaired')
+    with _busy() as status:
+        status.update('reading what is whole')
+        done = save_whole(bag, out)
+    _count_table(done.saved, '')
+    said = f'{out}: {done.saved.total():,} messages over {done.seconds:.1f} s'
+    for line in (said, *done.lost, 'what its recorder had not yet written is not in it'):
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -295,15 +356,21 @@ def tune(
     import tempfile
 
     from continuum_loc.estimator.settings import settings_of
-    from continuum_loc.offline.trials import scene_map_file, simulate, write_bag
+    from continuum_loc.mapping.scale import map_for
+    from continuum_loc.offline.scene_maps import scene_map_file
+    from continuum_loc.offline.trials import simulate, write_bag
     from continuum_loc.offline.tune import FACTORS, hold_out, PARAMETERS
     from continuum_loc.offline.tune import tune as sweep
     from continuum_loc.robot import load_robot
     from continuum_loc.settings import dump_settings
     from rich.progress import Progress
 
+    if bag is not None and map_file is None:
+        raise MapError('a bag of your own needs the map of its place: give `--map FILE` too')
     description = load_robot(robot)
     start = settings_of(description.name, settings)
+    if map_file is not None:
+        _say(map_file, map_for(description, map_file).notes)
     with (
         tempfile.TemporaryDirectory() as scratch,
         Progress(console=errors, transient=True) as progress,
@@ -381,6 +448,10 @@ def evaluate(
     minutes: Annotated[
         float | None, typer.Option(help='with `soak`: how long, instead of half an hour', min=0.5)
     ] = None,
+    worlds: Annotated[
+        list[str] | None,
+        typer.Option('--world', help='`ideal` or `disturbed` alone; studies print both'),
+    ] = None,
     scheduler: Annotated[
         str, typer.Option(help='address of a Dask scheduler to run the trials on')
     ] = '',
@@ -417,6 +488,7 @@ def evaluate(
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
     SCHEDULER.set(scheduler)
+    _choose_worlds(worlds or [])
     if run is None:
         claims = _evaluate_bags(folder, robot, map_file, settings, out, jobs)
     elif minutes is not None:
@@ -424,12 +496,41 @@ def evaluate(
 
         claims = soak(out, 60.0 * minutes, seed)
     else:
-        claims = run(out, quick, seed, jobs)
+        claims = _run_study(name, run, out, quick, seed, jobs)
     console.print(_claims_table(claims))
     for trial, error in _failed(out, name).items():
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
     raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+
+
+def _run_study(name: str, run: Any, out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
+    """Run a study; one that is reported is entered into the books, unless it is a quick run."""
+    from studies.support import books
+
+    if quick:
+        return run(out, quick, seed, jobs)
+    books.require_book(name)
+    claims = run(out, quick, seed, jobs)
+    if books.enter(name, seed, claims):
+        errors.print(
+            f'[yellow]reported before with other numbers of the filter:[/] see {books.LOG}',
+            highlight=False,
+        )
+    return claims
+
+
+def _choose_worlds(names: list[str]) -> None:
+    """Let studies run in these worlds alone, if there are any."""
+    if not names:
+        return
+    require_research()
+    from studies.support.worlds import WORLDS
+
+    for name in names:
+        if name not in WORLDS.get():
+            raise typer.BadParameter(f"--world '{name}': give {' or '.join(WORLDS.get())}")
+    WORLDS.set(tuple(dict.fromkeys(names)))
 
 
 def _study(name: str) -> Any:
@@ -468,10 +569,12 @@ def _evaluate_bags(
     folder: Path, robot: str, map_file: Path, settings: Path | None, out: Path, jobs: int
 ) -> list[Claim]:
     from continuum_loc.estimator.settings import settings_of
+    from continuum_loc.mapping.scale import map_for
     from continuum_loc.offline.bags import evaluate_bags
     from continuum_loc.robot import load_robot
 
     description = load_robot(robot)
+    _say(map_file, map_for(description, map_file).notes)
     return evaluate_bags(
         folder, description, map_file, settings_of(description.name, settings), out, jobs
     )
@@ -560,15 +663,27 @@ def map_convert(
         tuple[float, float, float] | None,
         typer.Option(help='a place that the surface is seen from, for clouds without normals'),
     ] = None,
+    scale: Annotated[
+        float, typer.Option(help='what lengths are multiplied by to be metres: 0.001 for mm')
+    ] = 1.0,
+    sigma: Annotated[
+        float | None,
+        typer.Option(help='standard deviation of a point [m]; default: what the file states'),
+    ] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help='distance of the points sampled from a mesh [m]')
+    ] = None,
 ) -> None:
     """
     Read a map in any known form and write it in another.
 
-    Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1`
+    The standard deviation is kept in `.npz` alone.
+
+    Example: `continuum-loc map convert scan.pcd map.npz --viewpoint 0 0 1 --sigma 0.002`
     """
     from continuum_loc.mapping.map_files import load_map
 
-    prior = load_map(source, viewpoint=viewpoint)
+    prior = load_map(source, viewpoint=viewpoint, scale=scale, sigma=sigma, spacing=spacing)
     prior.save(out)
     _describe_map(out, prior)
 
@@ -586,14 +701,26 @@ def map_info(file: Annotated[Path, typer.Argument(help='map file')]) -> None:
 
 
 def _describe_map(path: Path, prior: Any) -> None:
+    from continuum_loc.mapping.scale import size_note
+
     low, high = prior.points.min(axis=0), prior.points.max(axis=0)
     box = ' x '.join(f'{a:.2f}..{b:.2f}' for a, b in zip(low, high, strict=True))
     console.print(
-        f'{path}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, in {box} m, '
+        f'{escape(str(path))}: {len(prior):,} points, {1e3 * prior.spacing:.1f} mm apart, '
+        f'in {box} m, sigma {1e3 * prior.sigma:.3g} mm, '
         f'mean planarity {prior.planarity.mean():.2f}, '
         f'normals {"outward" if prior.oriented else "of either sign"}',
         highlight=False,
     )
+    _say(path, (*prior.notes, *size_note(prior)))
+
+
+def _say(path: Path, notes: Iterable[str]) -> None:
+    """Print what there is to know about a file that was read."""
+    for note in notes:
+        errors.print(
+            f'[yellow]note:[/] {escape(f"{path}: {note}")}', highlight=False, soft_wrap=True
+        )
 
 
 def _write_report(folder: Path) -> Path:
@@ -604,6 +731,29 @@ def _write_report(folder: Path) -> Path:
         status.update('writing the report')
         run = load_run(folder)
         return write_report(run, context_of(run))
+
+
+def _tell(folder: Path, summary: dict[str, Any]) -> bool:
+    """Say what a run gave, on one screen; whether nothing could be used of it, or of a sensor."""
+    from continuum_loc.offline.account import account_lines
+
+    if summary['poses']:
+        console.print(_run_table(summary))
+    else:
+        estimates = summary['estimates']
+        console.print(
+            f'{estimates["all"]} estimates ({estimates["tracking"]} tracking, '
+            f'{estimates["initialising"]} initialising, {estimates["lost"]} lost), none judged: '
+            f'no truth; {_speed(summary)}',
+            highlight=False,
+        )
+    for line in account_lines(summary['account']):
+        style = 'bold red' if line.startswith('PROBLEM') else ''
+        console.print(escape(line), style=style, highlight=False)
+    console.print(
+        f'report  [link=file://{folder.absolute()}/report.html]{folder}/report.html[/link]'
+    )
+    return bool(summary['account']['problems'])
 
 
 def _run_table(summary: dict[str, Any]) -> Any:
@@ -685,8 +835,9 @@ def _busy() -> Any:
     return errors.status('')
 
 
-def _progress(samples: Any, label: str, seconds: float | None) -> Any:
-    """Pass samples on, with a bar over the time that their stamps span."""
+@contextmanager
+def _bar(label: str, seconds: float | None) -> Iterator[Callable[[float], None]]:
+    """Show a bar; gives what is to be told the time of the data [s] that was reached."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -695,14 +846,26 @@ def _progress(samples: Any, label: str, seconds: float | None) -> Any:
         TextColumn('{task.completed:.1f} s'),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=errors, transient=True) as progress:
-        task, first, shown = progress.add_task(label, total=seconds), None, 0.0
-        for sample in samples:
-            first = sample.stamp if first is None else first
-            elapsed = (sample.stamp - first) * 1e-9
+    quiet = not errors.is_terminal  # a file gets no bar, and no empty line for one
+    with Progress(*columns, console=errors, transient=True, disable=quiet) as progress:
+        task, shown = progress.add_task(label, total=seconds), 0.0
+
+        def tell(elapsed: float) -> None:
+            nonlocal shown
             if elapsed - shown > 0.1:
                 shown = elapsed
                 progress.update(task, completed=shown)
+
+        yield tell
+
+
+def _progress(samples: Any, label: str, seconds: float | None) -> Any:
+    """Pass samples on, with a bar over the time that their stamps span."""
+    first = None
+    with _bar(label, seconds) as tell:
+        for sample in samples:
+            first = sample.stamp if first is None else first
+            tell((sample.stamp - first) * 1e-9)
             yield sample
 
 

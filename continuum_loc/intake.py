@@ -1,9 +1,10 @@
 """
-From messages to measurements that may be used.
+The one gate between messages and an estimator: what may be used, at which stamp, and what not.
 
-A queue that degrades in a defined order, and rules for stamps.
-
-Nothing here imports rclpy, so that all of it is tested without a graph.
+A live node and a replay pass it alike; a replay's clock is the log of its bag, so that the same
+bag gives the same. What a message has to be in itself is checked where it is decoded
+(`msg_tools`), what it has to be for this robot and at this time is checked here, and nowhere else.
+Nothing here imports rclpy.
 """
 
 from __future__ import annotations
@@ -11,12 +12,10 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
-import heapq
 import threading
-import time
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
-from continuum_loc.errors import MessageError
+from continuum_loc.errors import MeasurementError, MessageError
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -27,17 +26,17 @@ from continuum_loc.measurements import (
     StrainSample,
     TofFrame,
     TrackedPose,
+    TruthSample,
 )
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import live, Settings
 from msg_tools.convert import strain_is_stamped
-from msg_tools.topics import topic_spec, TRACKER
+from msg_tools.topics import topic_spec
 import numpy as np
 from pydantic import Field
 
-# What an overloaded node gives up first. IMU samples go last: they carry the motion between all
-# others.
-SACRIFICE = ('tof/points', 'strain', 'imu/mag', TRACKER, 'joint_states', 'imu/data_raw')
+T = TypeVar('T')
+END = 1e-6  # m; how far beyond the body's ends a station may be by rounding
 
 
 class IntakeSettings(Settings):
@@ -57,6 +56,12 @@ class IntakeSettings(Settings):
         description='most queued messages; beyond it ToF frames go first, then '
         'strain, fields, trackers, encoders, and IMU samples last',
     )
+    queue_bytes: int = Field(
+        64_000_000, ge=100_000, description='most queued bytes; beyond it the same go first'
+    )
+    largest_message: int = Field(
+        1_000_000, ge=1_000, description='a longer message is refused undecoded [bytes]'
+    )
     future_tolerance: float = live(
         0.5, gt=0.0, description='a stamp farther ahead of the clock is refused [s]'
     )
@@ -67,153 +72,9 @@ class IntakeSettings(Settings):
         'several agree: forward a gap, backward a new start [s]',
     )
     jump_confirmations: int = live(10, ge=1, description='how many samples must agree on a leap')
-
-
-class Queued(NamedTuple):
-    """
-    A message as it arrived.
-
-    Its place, topic, message, ROS time (ns) and monotonic time (s) of arrival.
-
-    place: stamp (ns), or the arrival where the stamp is too far ahead of it, as stamps from the
-    future must not hold up others; then the order of arrival.
-    """
-
-    place: tuple[int, int]
-    topic: str
-    message: Any
-    arrival: int
-    received: float
-
-    @property
-    def stamp(self) -> int:
-        """As far as it is known before it is checked [ns]."""
-        return rough_stamp(self.message, self.arrival)
-
-
-class Inbox:
-    """
-    The queue between reception (one thread puts) and estimation (one thread takes).
-
-    Each topic keeps its order of arrival; topics are merged by stamp, because reception takes them
-    one after the other, and a backlog would otherwise tear them apart.
-    """
-
-    def __init__(self, settings: IntakeSettings) -> None:
-        self.settings = settings
-        self.received: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
-        self._queues: dict[str, deque[Queued]] = {name: deque() for name in SACRIFICE}
-        self._ready = threading.Condition()
-        self._order = 0
-        self._size = 0
-
-    def __len__(self) -> int:
-        return self._size
-
-    def put(self, topic: str, message: Any, arrival: int) -> None:
-        """Queue a message; older ones are dropped where the queue has grown too long."""
-        kind = TRACKER if topic.startswith(TRACKER) else topic
-        with self._ready:
-            self.received[topic] += 1
-            stamp = rough_stamp(message, arrival)
-            ahead = stamp > arrival + nanoseconds(self.settings.future_tolerance)
-            place = (arrival if ahead else stamp, self._order)
-            self._queues[kind].append(Queued(place, topic, message, arrival, time.monotonic()))
-            self._order += 1
-            self._size += 1
-            self._relieve()
-            self._ready.notify()
-
-    def take(self, timeout: float) -> Queued | None:
-        """Return the message whose turn it is, or None when none came within `timeout` seconds."""
-        with self._ready:
-            if self._size == 0:
-                self._ready.wait(timeout)
-            heads = [queue for queue in self._queues.values() if queue]
-            if not heads:
-                return None
-            self._size -= 1
-            return min(heads, key=lambda queue: queue[0].place).popleft()
-
-    def clear(self) -> None:
-        """Forget everything queued."""
-        with self._ready:
-            for queue in self._queues.values():
-                queue.clear()
-            self._size = 0
-
-    def _relieve(self) -> None:
-        frames = self._queues[SACRIFICE[0]]
-        while frames and frames[-1].received - frames[0].received > self.settings.max_backlog:
-            self._drop(SACRIFICE[0])
-        while self._size > self.settings.queue_capacity:
-            self._drop(next(name for name in SACRIFICE if self._queues[name]))
-
-    def _drop(self, kind: str) -> None:
-        self._queues[kind].popleft()
-        self._size -= 1
-        self.dropped[kind] += 1
-
-
-class Early:
-    """
-    Messages that a simulated clock has not come to yet.
-
-    /clock comes by a queue of its own, which reception may empty after those of the data, and at
-    a high rate of play the tolerance of stamps is a very short time. So such a message waits until
-    the clock has come near its stamp, but `patience` seconds of real time at most from when it was
-    taken in.
-    """
-
-    def __init__(self, patience: float) -> None:
-        self._patience = patience
-        self._waiting: dict[int, tuple[float, Queued]] = {}  # since when, by order of arrival
-        self._by_stamp: list[tuple[int, int]] = []  # a heap of (stamp, order of arrival)
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def timely(self, new: list[Queued], clock: int, tolerance: float) -> list[Queued]:
-        """
-        Take messages in; give up those that may be judged, at `clock` (ns) and a tolerance [s].
-
-        Those that waited come first, by stamp, and count as having come just now. A message that
-        its own arrival does not make early never waits: a looped bag's clock jumps back.
-        """
-        free = []
-        latest = clock + nanoseconds(tolerance)
-        for queued in new:
-            if not queued.arrival or queued.stamp <= queued.arrival + nanoseconds(tolerance):
-                free.append(queued)
-            else:
-                self._waiting[queued.place[1]] = time.monotonic(), queued
-                heapq.heappush(self._by_stamp, (queued.stamp, queued.place[1]))
-        return [one._replace(arrival=clock) for one in self._released(latest)] + free
-
-    def _released(self, latest: int) -> list[Queued]:
-        """Messages stamped up to `latest` (ns), and those that waited in vain."""
-        free = []
-        while self._by_stamp and (
-            self._by_stamp[0][0] <= latest or self._by_stamp[0][1] not in self._waiting
-        ):
-            found = self._waiting.pop(heapq.heappop(self._by_stamp)[1], None)
-            free += [] if found is None else [found[1]]
-        before = time.monotonic() - self._patience
-        while self._waiting and next(iter(self._waiting.values()))[0] < before:
-            free.append(self._waiting.pop(next(iter(self._waiting)))[1])
-        return free
-
-
-def rough_stamp(message: Any, arrival: int) -> int:
-    """Read the stamp (ns) of a message that was not checked yet: good enough to sort by."""
-    header = getattr(message, 'header', None)
-    if header is not None:
-        return header.stamp.sec * NANOSECONDS + header.stamp.nanosec
-    data = getattr(message, 'data', None)
-    if data is not None and strain_is_stamped(message) and len(data) and np.isfinite(data[0]):
-        return nanoseconds(data[0])
-    return arrival
+    longest_gap: float = live(
+        5.0, gt=0.0, description='after a longer gap the data starts anew, too [s]'
+    )
 
 
 class StampGate:
@@ -223,9 +84,9 @@ class StampGate:
     `judge` returns None to use a sample, or the class of error under which it is refused. A sample
     that follows the last one of its own sensor is late, however far the others are: after a pause
     of the whole process, reception takes one topic after the other. A leap from both is believed
-    when `jump_confirmations` samples agree on it and none came meanwhile that does not leap:
-    forward it is a gap, backward the data starts again (`restarts` counts those), as a looped bag
-    does.
+    when `jump_confirmations` samples agree on it and none came meanwhile that does not leap. Then
+    it is a gap, which a motion prior bridges; but backward, as a looped bag leaps, or forward over
+    more than `longest_gap`, the data starts again, which `restarts` counts.
     """
 
     def __init__(self, settings: IntakeSettings) -> None:
@@ -267,28 +128,47 @@ class StampGate:
         agreeing = sum(abs(other - stamp) <= tolerance for other in self._leaping)
         if agreeing < self.settings.jump_confirmations:
             return False
-        if stamp < self.newest:
+        if not 0 <= stamp - self.newest <= nanoseconds(self.settings.longest_gap):
             self.reset()
             self.restarts += 1
         return True
 
 
 class Intake:
-    """Decodes, checks and counts. `report(kind, text)` is called once for each class of error."""
+    """
+    Decodes, checks and counts.
+
+    report(kind, text): called once for each class of error, and at each new start of the data.
+    restart: called before the first sample of such a start is given out, and after a failure, for
+    the estimator to forget the past. strict: the first that is refused raises its MessageError.
+    frame_prefix: what the robot's frames are called on the graph, before their names.
+
+    received, used: by topic. refused: by class of error. refusals: the number, and the first text,
+    by topic and class. tof_status: (256,) zones of each status in the frames used.
+    """
 
     def __init__(
         self,
         robot: RobotDescription,
-        settings: IntakeSettings,
-        report: Callable[[str, str], None],
+        settings: IntakeSettings | None = None,
+        report: Callable[[str, str], None] = lambda kind, text: None,
         frame_prefix: str = '',
+        restart: Callable[[], None] = lambda: None,
+        strict: bool = False,
     ) -> None:
-        self.robot, self.settings, self.frame_prefix = robot, settings, frame_prefix
-        self.gate = StampGate(settings)
+        self.robot, self.frame_prefix = robot, frame_prefix
+        self.settings = settings or IntakeSettings()
+        self.gate = StampGate(self.settings)
+        self.restart, self.strict = restart, strict
+        self.received: Counter[str] = Counter()
         self.used: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
+        self.refusals: dict[tuple[str, str], tuple[int, str]] = {}
+        self.failures = 0
+        self.tof_status = np.zeros(256, np.int64)
         self._report = report
         self._reported: set[str] = set()
+        self._counting = threading.Lock()  # reception refuses too
         self._zones = robot.tof_model.rows * robot.tof_model.columns
         self._names = {
             TofFrame: _names(robot.tof),
@@ -297,93 +177,188 @@ class Intake:
             TrackedPose: _names(robot.sensors),
         }
 
+    def parse(self, topic: str, data: bytes, read: Callable[[bytes, str], Any]) -> Any | None:
+        """
+        Deserialise a message by `read(data, type name)`, unless it is too long to be one.
+
+        None where it is refused.
+        """
+        kind, most = topic_spec(topic).type, self.settings.largest_message
+        try:
+            if len(data) <= most:
+                return read(data, kind)
+            wrong = 'size', f'{topic}: a message of {len(data)} bytes; valid: {most}'
+        except Exception as error:  # libraries state no closed set of errors for damaged bytes
+            said = f'{type(error).__name__}: {str(error)[:100]}'
+            wrong = 'bytes', f'{topic}: not a {kind} ({said})'
+        self.received[topic] += 1
+        self.refuse(*wrong, topic)
+        return None
+
     def accept(self, topic: str, message: Any, arrival: int) -> Measurement | None:
         """
-        Return the measurement of a message, or None where it is refused.
+        Return the measurement (or truth) of a message, or None where it is refused.
 
         arrival: the clock when it came [ns], 0 while a simulated clock has not begun. A refusal is
         counted, and reported once for its class.
         """
         try:
-            measurement = self._checked(topic, message, arrival)
-            refusal = self.gate.judge(
-                measurement.stamp, getattr(measurement, 'sensor', topic), arrival
-            )
-            if refusal:
-                raise MessageError(
-                    refusal,
-                    f'{topic}: stamp {measurement.stamp / 1e9:.6f} s refused as {refusal} '
-                    f'(newest {(self.gate.newest or 0) / 1e9:.6f} s, clock {arrival / 1e9:.6f} s)',
-                )
+            self._check_header(topic, message)
+            sample = topic_spec(topic).decode(message, arrival, topic)
         except MessageError as error:
-            self.refuse(error.kind, str(error))
+            self.received[topic] += 1
+            self.refuse(error.kind, str(error), topic)
+            return None
+        return self.admit(topic, sample, arrival)
+
+    def admit(self, topic: str, sample: Any, arrival: int) -> Measurement | None:
+        """Do as `accept` for a sample that is decoded already."""
+        self.received[topic] += 1
+        sample = self._without_prefix(sample)
+        try:
+            self.check(topic, sample)
+            if not isinstance(sample, TruthSample):  # which no estimator hears
+                self._check_stamp(topic, sample, arrival)
+        except MessageError as error:
+            self.refuse(error.kind, str(error), topic)
             return None
         self.used[topic] += 1
-        return measurement
+        if isinstance(sample, TofFrame):
+            self.tof_status += np.bincount(sample.status, minlength=256)
+        return sample
 
-    def refuse(self, kind: str, text: str) -> None:
+    def attempt(self, action: Callable[[], T], what: str) -> T | None:
+        """
+        Do `action` on what came from `what`.
+
+        A measurement that cannot be used is refused. Any other failure is counted, and the
+        estimate starts anew.
+        """
+        try:
+            return action()
+        except MeasurementError as error:
+            self.refuse(error.reason, f'{what}: {error}', what)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+            self.failures += 1
+            said = f'{type(error).__name__}: {error}'
+            self.refuse('failure', f'the estimator failed on {what}, starting anew ({said})', what)
+            self.restart()
+        return None
+
+    def refuse(self, kind: str, text: str, topic: str = '', count: int = 1) -> None:
         """Count an error, and report the first of its class."""
-        self.refused[kind] += 1
-        if kind not in self._reported:
-            self._reported.add(kind)
-            self._report(kind, text)
+        if self.strict:
+            raise MessageError(kind, text)
+        with self._counting:
+            self.refused[kind] += count
+            before, first = self.refusals.get((topic, kind), (0, text))
+            self.refusals[topic, kind] = before + count, first
+        self._tell(kind, text)
 
-    def _checked(self, topic: str, message: Any, arrival: int) -> Measurement:
-        if (
-            topic == 'strain'
-            and not strain_is_stamped(message)
-            and 'unstamped' not in self._reported
-        ):
-            self._reported.add('unstamped')
-            self._report(
-                'unstamped',
-                'strain: data_offset is 0, so the arrival time has to serve as the stamp',
-            )
-        measurement = topic_spec(topic).decode(message, arrival, topic)
-        measurement = self._without_prefix(measurement)
-        names = self._names.get(type(measurement))
-        if names is not None and measurement.sensor not in names:
+    def counts(self) -> dict[str, Any]:
+        """Give all that was counted, as a summary file holds it."""
+        refusals: dict[str, dict[str, Any]] = {}
+        for (topic, kind), (count, first) in sorted(self.refusals.items()):
+            refusals.setdefault(topic, {})[kind] = {'count': count, 'first': first}
+        return {
+            'received': dict(self.received),
+            'used': dict(self.used),
+            'refused': dict(self.refused),
+            'refusals': refusals,
+            'restarts': self.gate.restarts,
+            'failures': self.failures,
+            'tof_status': {
+                str(code): int(self.tof_status[code]) for code in np.flatnonzero(self.tof_status)
+            },
+        }
+
+    def check(self, topic: str, sample: Any) -> None:
+        """Raise MessageError where a decoded sample is none of this robot's."""
+        names = self._names.get(type(sample))
+        if names is not None and sample.sensor not in names:
             raise MessageError(
                 'unknown frame',
                 f"{topic}: robot '{self.robot.name}' has no such sensor "
-                f"'{measurement.sensor}'; valid: {', '.join(names) or 'none of this kind'}",
+                f"'{sample.sensor[:80]}'; valid: {', '.join(names) or 'none of this kind'}",
             )
-        self._check_content(topic, measurement)
-        return measurement
-
-    def _without_prefix(self, measurement: Any) -> Any:
-        prefix = self.frame_prefix
-        if prefix and getattr(measurement, 'sensor', '').startswith(prefix):
-            return replace(measurement, sensor=measurement.sensor.removeprefix(prefix))
-        return measurement
-
-    def _check_content(self, topic: str, measurement: Measurement) -> None:
-        if isinstance(measurement, TofFrame) and len(measurement.ranges) != self._zones:
-            raise MessageError(
-                'zones',
-                f"{topic}: {len(measurement.ranges)} zones of '{measurement.sensor}'; the "
-                f'robot description says {self._zones}',
-            )
-        if isinstance(measurement, StrainSample):
-            self._check_stations(topic, measurement.s)
-        if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
-            travel = measurement.position[measurement.names.index('insertion')]
+        if isinstance(sample, TofFrame):
+            self._check_zones(topic, len(sample.ranges))
+        elif isinstance(sample, StrainSample):
+            self._check_stations(topic, sample.s)
+        elif isinstance(sample, EncoderSample) and 'insertion' in sample.names:
+            travel = sample.position[sample.names.index('insertion')]
             if not np.isfinite(travel):
                 raise MessageError(
                     'value', f"{topic}: the position of joint 'insertion' is {travel}"
                 )
+        elif isinstance(sample, TruthSample):
+            self._check_truth(topic, len(sample.T_map_ring))
+
+    def _check_header(self, topic: str, message: Any) -> None:
+        """Refuse what is too much to be decoded, and tell that a stamp has to be made up."""
+        if topic == 'tof/points' and message.width * message.height > self._zones:
+            self._check_zones(topic, message.width * message.height)
+        if topic == 'strain' and not strain_is_stamped(message):
+            text = 'strain: data_offset is 0, so the arrival time has to serve as the stamp'
+            self._tell('unstamped', text)
+
+    def _check_zones(self, topic: str, zones: int) -> None:
+        if zones != self._zones:
+            raise MessageError(
+                'zones', f'{topic}: {zones} zones; the robot description says {self._zones}'
+            )
 
     def _check_stations(self, topic: str, s: np.ndarray) -> None:
         if self.robot.strain is None:
             raise MessageError(
                 'unknown frame', f"{topic}: robot '{self.robot.name}' has no strain sensor"
             )
-        if s.min() < -1e-6 or s.max() > self.robot.length + 1e-6 or (np.diff(s) <= 0.0).any():
+        if s.min() < -END or s.max() > self.robot.length + END or (np.diff(s) <= 0.0).any():
             raise MessageError(
                 'value',
                 f'{topic}: stations s must rise within 0 to {self.robot.length} m, got '
                 f'{s.min():.4g} to {s.max():.4g}',
             )
+
+    def _check_truth(self, topic: str, poses: int) -> None:
+        expected = 1 + len(self.robot.rings)
+        if poses != expected:
+            raise MessageError(
+                'size',
+                f'{topic}: the truth holds {poses} poses; this robot has {expected}: base, '
+                f'{", ".join(self.robot.ring_names)}',
+            )
+
+    def _check_stamp(self, topic: str, sample: Any, arrival: int) -> None:
+        """Judge the stamp; where the data starts again there, so does the estimator."""
+        gate, before = self.gate, self.gate.newest
+        restarts, stamp = gate.restarts, sample.stamp
+        refusal = gate.judge(stamp, getattr(sample, 'sensor', topic), arrival)
+        if refusal:
+            raise MessageError(
+                refusal,
+                f'{topic}: stamp {stamp / NANOSECONDS:.6f} s refused as {refusal} (newest '
+                f'{(before or 0) / NANOSECONDS:.6f} s, clock {arrival / NANOSECONDS:.6f} s)',
+            )
+        if gate.restarts != restarts:
+            way = 'backward' if stamp < before else 'forward'
+            self._report(
+                'restart',
+                f'time went {way}, from {before / NANOSECONDS:.3f} to '
+                f'{stamp / NANOSECONDS:.3f} s: the data starts again, and so does the estimate',
+            )
+            self.restart()
+
+    def _without_prefix(self, sample: Any) -> Any:
+        prefix = self.frame_prefix
+        if prefix and getattr(sample, 'sensor', '').startswith(prefix):
+            return replace(sample, sensor=sample.sensor.removeprefix(prefix))
+        return sample
+
+    def _tell(self, kind: str, text: str) -> None:
+        if kind not in self._reported:
+            self._reported.add(kind)
+            self._report(kind, text)
 
 
 def _names(sensors: tuple) -> tuple[str, ...]:

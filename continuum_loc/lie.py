@@ -220,11 +220,7 @@ def _polynomial(xi: np.ndarray, coefficients: tuple[np.ndarray, ...]) -> np.ndar
 
 
 def _left_coefficients(angle: np.ndarray) -> list[np.ndarray]:
-    """
-    c1..c4 of J_l = I + c1 A + c2 A^2 + c3 A^3 + c4 A^4.
-
-    Barfoot, State Estimation for Robotics, eq. 7.83.
-    """
+    """c1..c4 of J_l = I + c1 A + c2 A^2 + c3 A^3 + c4 A^4 (Barfoot, eq. 7.83)."""
     small = angle < SMALL_ANGLE
     f = np.where(small, 1.0, angle)
     s, c = np.sin(f), np.cos(f)

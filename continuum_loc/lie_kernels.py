@@ -1,25 +1,44 @@
 """
 SE(3) for compiled loops: one element at a time, results written into the caller's arrays.
 
-Same conventions as `continuum_loc.lie`, which is the oracle of these functions in the tests.
-Beyond it, `*_jacobian_times` give the exact derivative of J(xi) w with respect to xi, which the
+The conventions are those of `continuum_loc.lie`, which is the oracle of these functions in the
+tests. Beyond it, `polynomial_times` gives the exact derivative of J(xi) w by xi, which the
 Gaussian-process factors and the interpolation need. Arrays are float64 and C-contiguous; no
-function allocates.
+function allocates: they work in records of TWIST and SCRATCH that the caller owns.
 
-Everything that the adjoint generates has the form [[X, Y], [0, X]], so a product of two costs
-three 3x3 products; `_block_product` uses that.
+Everything that the adjoint generates has the form [[X, Y], [0, X]], so that a product of two costs
+three 3x3 products; `block_product` uses that.
 """
 
 from __future__ import annotations
 
 import math
 
+from continuum_loc.compiling import kernel
 from continuum_loc.lie import INVERSE_SERIES, LEFT_SERIES, SMALL_ANGLE
-from numba import njit
 import numpy as np
 
+# A twist x and a power series of its adjoint, f(ad(x)) = sum c_i ad(x)^i.
+TWIST = np.dtype(
+    [
+        ('x', float, 6),
+        ('ad', float, (6, 6)),  # its adjoint matrix
+        ('c', float, 5),  # the coefficients
+        ('dc', float, 5),  # their derivatives by the angle phi, over phi
+    ]
+)
+# Room for what is of no use after a function returns.
+SCRATCH = np.dtype(
+    [
+        ('pose', float, (4, 4)),
+        ('matrix', float, (6, 6)),
+        ('blocks', float, (2, 6, 6)),
+        ('powers', float, (5, 6)),
+    ]
+)
 
-@njit(cache=True, inline='always')
+
+@kernel(inline='always')
 def _hat_into(out, row, column, x, y, z):
     """Write the skew matrix of (x, y, z) into the 3x3 block of `out` at (row, column)."""
     out[row, column] = 0.0
@@ -33,16 +52,18 @@ def _hat_into(out, row, column, x, y, z):
     out[row + 2, column + 2] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def ad(x, out):
     """Adjoint matrix of x (6,) in se(3), into out (6, 6)."""
     _hat_into(out, 0, 0, x[3], x[4], x[5])
     _hat_into(out, 3, 3, x[3], x[4], x[5])
     _hat_into(out, 0, 3, x[0], x[1], x[2])
-    out[3:, :3] = 0.0
+    for i in range(3):
+        for j in range(3):
+            out[3 + i, j] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def bracket(x, y, out):
     """Out (6,) = ad(x) y."""
     out[0] = x[4] * y[2] - x[5] * y[1] + x[1] * y[5] - x[2] * y[4]
@@ -53,7 +74,7 @@ def bracket(x, y, out):
     out[5] = x[3] * y[4] - x[4] * y[3]
 
 
-@njit(cache=True)
+@kernel
 def block_product(A, B, out):
     """Out = A B for matrices of the form [[X, Y], [0, X]]."""
     for i in range(3):
@@ -69,7 +90,7 @@ def block_product(A, B, out):
             out[i + 3, j] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def product(A, B, out):
     """Out (6, 6) = A B."""
     for i in range(6):
@@ -80,7 +101,7 @@ def product(A, B, out):
             out[i, j] = total
 
 
-@njit(cache=True)
+@kernel
 def apply(A, x, out):
     """Out (6,) = A x."""
     for i in range(6):
@@ -90,7 +111,7 @@ def apply(A, x, out):
         out[i] = total
 
 
-@njit(cache=True)
+@kernel
 def exp(x, T):
     """Exponential of x, into T (4, 4)."""
     a, b, c = x[3], x[4], x[5]
@@ -123,7 +144,7 @@ def exp(x, T):
     T[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def log(T, x):
     """
     Logarithm of T, into x (6,), angle in [0, pi].
@@ -163,7 +184,7 @@ def log(T, x):
     x[5] = h
 
 
-@njit(cache=True)
+@kernel
 def relative(Ta, Tb, out):
     """Out (4, 4) = Ta^-1 Tb."""
     for i in range(3):
@@ -178,7 +199,7 @@ def relative(Ta, Tb, out):
     out[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def compose(Ta, Tb, out):
     """Out (4, 4) = Ta Tb; `out` must not be one of them."""
     for i in range(3):
@@ -189,7 +210,7 @@ def compose(Ta, Tb, out):
     out[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def adjoint(T, out):
     """Out (6, 6) = Ad(T)."""
     for j in range(3):
@@ -202,7 +223,7 @@ def adjoint(T, out):
         out[2, j + 3] = T[0, 3] * T[1, j] - T[1, 3] * T[0, j]
 
 
-@njit(cache=True)
+@kernel
 def _taylor(series, square, value, slope):
     """Value of the Taylor polynomials in phi^2 and their derivative by phi, divided by phi."""
     for row in range(series.shape[0]):
@@ -215,9 +236,9 @@ def _taylor(series, square, value, slope):
         slope[row] = 2.0 * derivative
 
 
-@njit(cache=True)
+@kernel
 def right_coefficients(x, c, dc):
-    """C (5,): J_r(x) = sum c_i ad(x)^i; dc (5,): derivative of each by the angle phi, over phi."""
+    """Write c (5,) and dc (5,) of J_r(x) = sum c_i ad(x)^i, as TWIST has them."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0] = 1.0
@@ -238,13 +259,9 @@ def right_coefficients(x, c, dc):
     c[1], c[3], dc[1], dc[3] = -c[1], -c[3], -dc[1], -dc[3]
 
 
-@njit(cache=True)
+@kernel
 def right_inverse_coefficients(x, c, dc):
-    """
-    Coefficients c (5,) of J_r(x)^-1 = sum c_i ad(x)^i, and dc (5,).
-
-    dc: derivative of each by the angle phi, over phi.
-    """
+    """Do as `right_coefficients` for J_r(x)^-1 = sum c_i ad(x)^i."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
     f = math.sqrt(square)
     c[0], c[1], c[3] = 1.0, 0.5, 0.0
@@ -264,12 +281,12 @@ def right_inverse_coefficients(x, c, dc):
         dc[4] = ((dslope - dh) / (square * square) - 4.0 * c[4] / f) / f
 
 
-@njit(cache=True)
+@kernel
 def polynomial(c, A, out, work):
     """
-    Out = c0 I + c1 A + (c2 I + c3 A + c4 A^2) A^2: two products.
+    Out = sum c_i A^i for A of the form [[X, Y], [0, X]]; work (2, 6, 6).
 
-    A of the form [[X, Y], [0, X]]; work (2, 6, 6).
+    As c0 I + c1 A + (c2 I + c3 A + c4 A^2) A^2 it takes two products.
     """
     square, outer = work[0], work[1]
     block_product(A, A, square)
@@ -284,26 +301,29 @@ def polynomial(c, A, out, work):
         out[i, i] += c[0]
 
 
-@njit(cache=True)
-def polynomial_times(c, dc, x, A, w, value, derivative, work, vectors):
+@kernel
+def polynomial_times(twist, w, value, derivative, scratch):
     """
-    Value (6,) = f(A) w and derivative (6, 6) = d(f(ad(x)) w)/dx for f(A) = sum c_i A^i, A = ad(x).
+    Write f(ad(x)) w into value (6,), and its derivative by x into derivative (6, 6).
 
-    With w_i = A^i w: d(w_i)/dx = D_i, D_1 = -ad(w), D_{i+1} = A D_i - ad(w_i); the coefficients
-    themselves add sum (c_i'/phi) w_i [0; phi]^T. work (2, 6, 6), vectors (5, 6).
+    f is the series of `twist`, a TWIST. With w_i = ad(x)^i w: d(w_i)/dx = D_i, D_1 = -ad(w),
+    D_{i+1} = ad(x) D_i - ad(w_i); the coefficients themselves add sum (c_i'/phi) w_i [0; phi]^T.
     """
+    x, c, dc, vectors = twist.x, twist.c, twist.dc, scratch.powers
     for i in range(6):
         vectors[0, i] = w[i]
     for k in range(1, 5):
         bracket(x, vectors[k - 1], vectors[k])
-    derivative[:, :] = 0.0
-    D = work[0]
-    scratch = work[1]
-    D[:, :] = 0.0
+    D, following = scratch.blocks[0], scratch.blocks[1]
+    for i in range(6):
+        for j in range(6):
+            derivative[i, j] = following[i, j] = 0.0
     for k in range(1, 5):
         if k > 1:
-            block_product(A, D, scratch)
-            D[:, :] = scratch
+            block_product(twist.ad, D, following)
+        for i in range(6):
+            for j in range(6):
+                D[i, j] = following[i, j]
         _subtract_ad(D, vectors[k - 1])
         if c[k] != 0.0:
             for i in range(6):
@@ -319,7 +339,7 @@ def polynomial_times(c, dc, x, A, w, value, derivative, work, vectors):
             derivative[i, j] += rank_one * x[j]
 
 
-@njit(cache=True)
+@kernel
 def _subtract_ad(D, x):
     """D -= ad(x)."""
     for offset in (0, 3):
@@ -337,21 +357,11 @@ def _subtract_ad(D, x):
     D[2, 4] -= x[0]
 
 
-@njit(cache=True)
-def pose_error(T_wanted, T, e, J, W, V, M):
-    """Write e (6,) = Log(T_wanted^-1 T) and its Jacobian J (6, 6) by T; W, V, M a workspace."""
-    relative(T_wanted, T, M[0])
-    log(M[0], e)
-    ad(e, W[0])
-    right_inverse_coefficients(e, V[0], V[1])
-    polynomial(V[0], W[0], J, W[1:3])
-
-
-@njit(cache=True)
-def workspace():
-    """
-    Scratch that the functions above and the interpolation share.
-
-    Allocate it once outside a loop.
-    """
-    return np.zeros((12, 6, 6)), np.zeros((16, 6)), np.zeros((4, 4, 4))
+@kernel
+def pose_error(T_wanted, T, error, J, scratch):
+    """Write Log(T_wanted^-1 T) into `error`, a TWIST, and its Jacobian by T into J (6, 6)."""
+    relative(T_wanted, T, scratch.pose)
+    log(scratch.pose, error.x)
+    ad(error.x, error.ad)
+    right_inverse_coefficients(error.x, error.c, error.dc)
+    polynomial(error.c, error.ad, J, scratch.blocks)

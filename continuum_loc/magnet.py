@@ -1,9 +1,10 @@
 """
 The field of the ring magnet at the base: the paper's point dipole (eq. 2), and the exact ring.
 
-Both take positions relative to the magnet's centre, in the magnet's frame: its axis is x (as the
-base's x in the robot files), metres in, tesla out. A negative `remanence` is a magnet mounted
-upside down.
+The shape estimator, the filter's Hall factor and the simulator all take it from here. Both models
+take positions [m] relative to the magnet's centre, in the magnet's frame, and give tesla. The
+axis is x, as the base's x in the robot files. A negative `remanence` is a magnet mounted upside
+down.
 
 The ring is two coaxial current sheets of opposite sign, at the outer and the inner radius. A
 sheet's field is Derby and Olbert, "Cylindrical magnets and ideal solenoids" (Am. J. Phys. 78,
@@ -15,54 +16,44 @@ outside the magnet. So the gradient is exact too.
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
+from continuum_loc.compiling import kernel
+from continuum_loc.errors import InputError, SettingsError
 from continuum_loc.lie import hat
 from continuum_loc.robot import Magnet
-from numba import njit
 import numpy as np
 
 MU_0 = 4e-7 * math.pi
 FieldModel = Literal['ring', 'dipole']
 
 
-def magnet_volume(magnet: Magnet) -> float:
-    """Volume of the magnetised material [m^3]."""
-    return math.pi / 4.0 * (magnet.outer_diameter**2 - magnet.inner_diameter**2) * magnet.length
+class MagnetParameters(NamedTuple):
+    """A magnet as the compiled kernels take it."""
+
+    dipole: float  # mu_0 M / 4 pi [T m^3], signed
+    sheet: float  # remanence / pi [T], signed
+    half_length: float  # [m]; 0 stands for the dipole model
+    inner: float  # radius [m]
+    outer: float  # radius [m]
 
 
 def dipole_moment(magnet: Magnet) -> float:
-    """
-    Signed moment along the axis [A m^2].
-
-    remanence * volume / mu_0 (M_c of the paper's eq. 1).
-    """
-    return magnet.remanence * magnet_volume(magnet) / MU_0
+    """Signed moment along the axis [A m^2]: remanence * volume / mu_0 (M_c of eq. 1)."""
+    section = math.pi / 4.0 * (magnet.outer_diameter**2 - magnet.inner_diameter**2)
+    return magnet.remanence * (section * magnet.length) / MU_0
 
 
-def with_moment(magnet: Magnet, moment: float) -> Magnet:
-    """Set the magnet's remanence so that its moment is `moment` [A m^2]."""
-    return magnet.model_copy(update={'remanence': moment * MU_0 / magnet_volume(magnet)})
-
-
-def magnet_parameters(magnet: Magnet, model: FieldModel = 'ring') -> np.ndarray:
-    """
-    (5,) what the compiled kernels need.
-
-    mu_0 M / 4 pi, then remanence / pi, half length, inner and outer radius. The half length is 0
-    for the dipole model.
-    """
+def magnet_parameters(magnet: Magnet, model: FieldModel = 'ring') -> MagnetParameters:
+    """Describe `magnet` to the kernels. Raises SettingsError for a model that does not exist."""
     if model not in ('ring', 'dipole'):
-        raise ValueError(f"field model '{model}' does not exist; valid: ring, dipole")
-    half_length = magnet.length / 2.0 if model == 'ring' else 0.0
-    return np.array(
-        [
-            1e-7 * dipole_moment(magnet),
-            magnet.remanence / math.pi,
-            half_length,
-            magnet.inner_diameter / 2.0,
-            magnet.outer_diameter / 2.0,
-        ]
+        raise SettingsError(f"field model '{model}' does not exist; valid: ring, dipole")
+    return MagnetParameters(
+        dipole=1e-7 * dipole_moment(magnet),
+        sheet=magnet.remanence / math.pi,
+        half_length=magnet.length / 2.0 if model == 'ring' else 0.0,
+        inner=magnet.inner_diameter / 2.0,
+        outer=magnet.outer_diameter / 2.0,
     )
 
 
@@ -75,26 +66,17 @@ def ring_field(magnet: Magnet, p: np.ndarray) -> np.ndarray:
     return field_and_gradient(magnet, p, 'ring')[0]
 
 
-def dipole_field(magnet: Magnet, p: np.ndarray) -> np.ndarray:
-    """
-    (..., 3) field [T] of the point dipole of equal moment at `p` (..., 3) [m].
-
-    In the magnet's frame (paper eq. 2).
-    """
-    return field_and_gradient(magnet, p, 'dipole')[0]
-
-
 def field_and_gradient(
     magnet: Magnet, p: np.ndarray, model: FieldModel = 'ring'
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Field (..., 3) [T] and its gradient dB_i/dp_j (..., 3, 3) [T/m] at `p` (..., 3) [m].
+    Field (..., 3) [T] and gradient dB_i/dp_j (..., 3, 3) [T/m] at `p` (..., 3) [m], magnet frame.
 
-    In the magnet's frame.
+    Raises InputError for positions of another shape, SettingsError for an unknown model.
     """
     p = np.asarray(p, dtype=float)
     if p.shape[-1:] != (3,):
-        raise ValueError(f'positions must have shape (..., 3), got {p.shape}')
+        raise InputError(f'positions must have shape (..., 3), got {p.shape}')
     field, gradient = _field_batch(
         magnet_parameters(magnet, model), np.ascontiguousarray(p.reshape(-1, 3))
     )
@@ -103,25 +85,23 @@ def field_and_gradient(
 
 def invert_dipole(magnet: Magnet, field: np.ndarray) -> np.ndarray:
     """
-    (..., 3) the one position with x >= 0 whose dipole field is `field` (..., 3) [T].
+    (..., 3) the one position [m] with x >= 0 whose dipole field is `field` (..., 3) [T].
 
-    -p has the same field.
-
-    In the plane of axis and field, tan(beta) = 3 tan(theta) / (2 - tan^2(theta)) for the field's
-    angle beta and the position's angle theta off the axis: a quadratic with one root in 0..90
-    degrees for each beta.
+    The opposite position -p has the same field. In the plane of axis and field, the field's angle
+    beta and the position's angle theta off the axis obey tan(beta) = 3 tan(theta) /
+    (2 - tan^2(theta)): a quadratic with one root in 0..90 degrees for each beta.
     """
     field = np.asarray(field, dtype=float)
     if field.shape[-1:] != (3,):
-        raise ValueError(f'fields must have shape (..., 3), got {field.shape}')
+        raise InputError(f'fields must have shape (..., 3), got {field.shape}')
     rows = np.ascontiguousarray(field.reshape(-1, 3))
     k = 1e-7 * dipole_moment(magnet)
     return np.array([invert_dipole_once(k, row) for row in rows]).reshape(field.shape)
 
 
-@njit(cache=True)
+@kernel
 def invert_dipole_once(k, field):
-    """`invert_dipole` of one field (3,), for k = mu_0 M / 4 pi."""
+    """Invert the dipole for one field (3,), with k = mu_0 M / 4 pi."""
     sign = 1.0 if k > 0.0 else -1.0
     along, across = sign * field[0], math.hypot(field[1], field[2])
     # The root of across u^2 + 3 along u - 2 across = 0, in the form that does not cancel for
@@ -138,29 +118,25 @@ def invert_dipole_once(k, field):
     return distance * np.array([cosine, sine * cy, sine * cz])
 
 
-@njit(cache=True)
-def _field_batch(parameters, points):
+@kernel
+def _field_batch(magnet, points):
     field = np.empty_like(points)
     gradient = np.empty((points.shape[0], 3, 3))
     for i in range(points.shape[0]):
-        evaluate_field(parameters, points[i], field[i], gradient[i])
+        evaluate_field(magnet, points[i], field[i], gradient[i])
     return field, gradient
 
 
-@njit(cache=True)
-def evaluate_field(parameters, p, field, gradient):
-    """
-    Field and gradient at one point, in the magnet's frame.
-
-    Written into `field` (3,) and `gradient` (3, 3).
-    """
-    if parameters[2] == 0.0:
-        _dipole(parameters[0], p, field, gradient)
+@kernel
+def evaluate_field(magnet, p, field, gradient):
+    """Write the field (3,) and its gradient (3, 3) at one point of the magnet's frame."""
+    if magnet.half_length == 0.0:
+        _dipole(magnet.dipole, p, field, gradient)
     else:
-        _ring(parameters[1], parameters[2], parameters[3], parameters[4], p, field, gradient)
+        _ring(magnet, p, field, gradient)
 
 
-@njit(cache=True)
+@kernel
 def _dipole(k, p, field, gradient):
     """B = k (3 p x - r^2 e_x) / r^5, and its gradient."""
     r2 = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
@@ -176,12 +152,14 @@ def _dipole(k, p, field, gradient):
     field[0] -= scale * r2
 
 
-@njit(cache=True)
-def _ring(strength, half_length, inner, outer, p, field, gradient):
+@kernel
+def _ring(magnet, p, field, gradient):
+    """B of the outer current sheet less that of the inner one, and its gradient."""
+    strength = magnet.sheet
     rho = math.sqrt(p[1] * p[1] + p[2] * p[2])
-    radial, axial, radial_slope, axial_slope = _sheet(outer, half_length, rho, p[0])
-    if inner > 0.0:
-        r, a, dr, da = _sheet(inner, half_length, rho, p[0])
+    radial, axial, radial_slope, axial_slope = _sheet(magnet.outer, magnet.half_length, rho, p[0])
+    if magnet.inner > 0.0:
+        r, a, dr, da = _sheet(magnet.inner, magnet.half_length, rho, p[0])
         radial, axial, radial_slope, axial_slope = (
             radial - r,
             axial - a,
@@ -203,7 +181,7 @@ def _ring(strength, half_length, inner, outer, p, field, gradient):
     gradient[1, 2] = gradient[2, 1] = strength * (outward - per_rho) * cy * cz
 
 
-@njit(cache=True)
+@kernel
 def _sheet(a, half_length, rho, x):
     """B_rho, B_x, dB_rho/dx, dB_x/dx of a unit current sheet (remanence / pi = 1), radius a."""
     gamma = (a - rho) / (a + rho)
@@ -223,13 +201,13 @@ def _sheet(a, half_length, rho, x):
     return radial, axial, radial_slope, axial_slope
 
 
-@njit(cache=True)
+@kernel
 def _cel(kc, p, c, s):
     """
-    Bulirsch's complete elliptic integral.
+    Bulirsch's complete elliptic integral, for p > 0 and kc > 0.
 
-    Of (c cos^2 + s sin^2) / ((cos^2 + p sin^2) sqrt(cos^2 + kc^2 sin^2)) over 0..pi/2, for p > 0
-    and kc > 0.
+    It is the integral of (c cos^2 + s sin^2) / ((cos^2 + p sin^2) sqrt(cos^2 + kc^2 sin^2)) over
+    0..pi/2.
     """
     k = kc
     p = math.sqrt(p)
@@ -255,6 +233,34 @@ def _cel(kc, p, c, s):
     return math.pi / 2.0 * (s + c * em) / (em * (em + p))
 
 
+@kernel
+def field_error(magnet, R, p, earth, measured, residual, J):
+    """
+    Write R^T (B(p) + earth) - measured [T] (3,) and its Jacobian J (3, 6), for one body.
+
+    R, p: its rotation and position in the magnet's frame; J is by a right perturbation [rho; phi].
+    This is `field_residual_and_jacobian` for compiled callers.
+    """
+    source, gradient = np.empty(3), np.empty((3, 3))
+    evaluate_field(magnet, p, source, gradient)
+    h = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            h[i] += R[j, i] * (source[j] + earth[j])
+    for i in range(3):
+        residual[i] = h[i] - measured[i]
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                for n in range(3):
+                    total += R[k, i] * gradient[k, n] * R[n, j]
+            J[i, j] = total
+    # d(R^T w) = [h]x phi
+    J[0, 3], J[0, 4], J[0, 5] = 0.0, -h[2], h[1]
+    J[1, 3], J[1, 4], J[1, 5] = h[2], 0.0, -h[0]
+    J[2, 3], J[2, 4], J[2, 5] = -h[1], h[0], 0.0
+
+
 def field_residual_and_jacobian(
     T_map_body: np.ndarray,
     magnet: Magnet,
@@ -266,12 +272,12 @@ def field_residual_and_jacobian(
     """
     Residual (..., 3) = R^T (B(p) + earth) - measured [T], and its Jacobian (..., 3, 6).
 
-    The Jacobian is by a right perturbation [rho; phi] of T_map_body (..., 4, 4): with h the
-    predicted field in the body's frame it is [R^T (dB/dp) R, [h]x].
+    The Jacobian is by a right perturbation [rho; phi] of T_map_body (..., 4, 4): it is
+    [R^T (dB/dp) R, [h]x], where h is the predicted field in the body's frame.
 
-    T_map_magnet: (4, 4) pose of the magnet's centre, its axis along x. measured: (..., 3) field
-    [T] in the body's frame. earth_field: (3,) in map [T]. A saturated axis is nan in `measured`
-    and in the residual: leave it out.
+    T_map_magnet: (4, 4) pose of the magnet's centre, with its axis along x. measured: (..., 3) [T]
+    in the body's frame. earth_field: (3,) [T] in map. A saturated axis is nan in `measured` and in
+    the residual, and has to be left out.
     """
     R_magnet, R = T_map_magnet[:3, :3], T_map_body[..., :3, :3]
     p_magnet = (T_map_body[..., :3, 3] - T_map_magnet[:3, 3]) @ R_magnet

@@ -14,12 +14,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from continuum_loc.settings import load_bundled, Settings
+from continuum_loc.settings import load_bundled, Name, Settings
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 ROBOTS_FOLDER = Path(__file__).parent / 'robots'
+
+# What no robot in metres exceeds, and what nearly every one in millimetres does.
+LONGEST, THICKEST = 100.0, 1.0  # m
+LONGEST_ARM = 0.5  # m: from a ring to a sensor on a stalk, beside ten radii of the body
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
@@ -71,7 +75,7 @@ class Mount(Settings):
 class Sensor(Settings):
     """A sensor's name (its `frame_id`), its ring and its mount there."""
 
-    name: str
+    name: Name
     ring: str
     mount: Mount = Mount(xyz=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
 
@@ -79,7 +83,7 @@ class Sensor(Settings):
 class Ring(Settings):
     """A sensor disc at unstretched arclength `s` from the base."""
 
-    name: str
+    name: Name
     s: float = Field(ge=0.0, description='arclength from the base [m]')
 
 
@@ -270,7 +274,7 @@ class Magnet(Settings):
 class RobotDescription(Settings):
     """Everything that simulator and estimator share about one robot."""
 
-    name: str
+    name: Name
     length: float = Field(gt=0.0, description='unstretched backbone length [m]')
     radius: float = Field(gt=0.0, description='outer radius of the body [m]')
     base: Base = Base()
@@ -288,6 +292,7 @@ class RobotDescription(Settings):
 
     @model_validator(mode='after')
     def _consistent(self) -> RobotDescription:
+        _check_units(self)
         arclengths = [ring.s for ring in self.rings]
         if any(b - a < 1e-6 for a, b in zip(arclengths, arclengths[1:], strict=False)):
             raise ValueError(
@@ -372,10 +377,34 @@ class RobotDescription(Settings):
         return float(self.ring_arclengths[self.ring_names.index(self.sensor(name).ring)])
 
 
-def load_robot(name_or_path: str | Path) -> RobotDescription:
-    """
-    Load a robot that comes with the package, or one of your own from a YAML file.
+def _check_units(robot: RobotDescription) -> None:
+    """Refuse lengths that no continuum robot has: a file in millimetres."""
+    far = LONGEST_ARM + 10.0 * robot.radius
+    lengths = [
+        ('length', robot.length, LONGEST),
+        ('radius', robot.radius, THICKEST),
+        *((f"the mount of '{one.name}'", _reach(one.mount), far) for one in robot.sensors),
+        *((f"'s' of ring '{ring.name}'", ring.s, 10.0 * robot.length) for ring in robot.rings),
+        ('base.sigma_position', robot.base.sigma_position, LONGEST),
+        ('tof_model.max_range', robot.tof_model.max_range, LONGEST),
+    ]
+    if robot.strain is not None:
+        lengths.append(('strain.spacing', robot.strain.spacing, 10.0 * robot.length))
+    if robot.magnet is not None:
+        lengths.append(('magnet.outer_diameter', robot.magnet.outer_diameter, 2.0 * THICKEST))
+    for name, length, most in lengths:
+        if length > most:
+            raise ValueError(
+                f'{name} of {length:g} m is more than the {most:g} m that are possible here; it '
+                f'looks like millimetres: write metres ({1e-3 * length:g})'
+            )
 
-    The package has `engine`, `soft_arm` and `hall_arm`.
-    """
+
+def _reach(mount: Mount) -> float:
+    """Distance [m] of a mount from its ring's centre, without building its pose."""
+    return mount.radius if mount.xyz is None else float(np.linalg.norm(mount.xyz))
+
+
+def load_robot(name_or_path: str | Path) -> RobotDescription:
+    """Load a robot of the package (`engine`, `soft_arm`, `hall_arm`) or one of your own (YAML)."""
     return load_bundled(RobotDescription, ROBOTS_FOLDER, name_or_path, 'robot')

@@ -3,18 +3,30 @@ Typed settings read from YAML: one way to load them, one way to complain about t
 
 Every YAML file of the package (robot, plant, estimator, scene) is a `Settings` subclass. A key
 that does not exist is refused with the nearest valid name; a value out of range is refused with
-its place.
+its place and its line.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import difflib
 from pathlib import Path
-from typing import Any, TypeVar
+import re
+from typing import Annotated, Any, get_args, TypeVar
 
 from continuum_loc.errors import SettingsError
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-import yaml
+from continuum_loc.yaml_files import read_yaml, write_yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    field_validator,
+    ValidationError,
+    ValidationInfo,
+)
+
+LONGEST_NAME = 100  # characters; a name becomes part of a file's, which may have 255
 
 
 class Settings(BaseModel):
@@ -24,6 +36,43 @@ class Settings(BaseModel):
         extra='forbid', frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False
     )
 
+    @field_validator('*', mode='before')
+    @classmethod
+    def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse `true` where a number is asked for; pydantic would take it for 1."""
+        kinds = _kinds(cls.model_fields[info.field_name].annotation)
+        given = value if isinstance(value, (list, tuple)) else (value,)
+        if kinds & {int, float} and bool not in kinds:
+            if any(isinstance(one, bool) for one in given):
+                raise ValueError(f'a number is needed, not a truth value (got {value!r})')
+        return value
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """Find all types in an annotation, those within `tuple[...]`, `... | None` and so on."""
+    inner = get_args(annotation)
+    return set().union(*map(_kinds, inner)) if inner else {annotation}
+
+
+def check_name(name: str) -> str:
+    """
+    Return a name of a robot, ring, sensor or profile.
+
+    Names become parts of file names, topics, frames and pages. Raises ValueError for one in which
+    a path or markup could hide.
+    """
+    if not re.fullmatch(r'[A-Za-z0-9_-][A-Za-z0-9_.-]*', name):
+        raise ValueError(
+            f'{name!r} is no name: use letters, digits, `_`, `-` and `.`, the first not a `.`'
+        )
+    if len(name) > LONGEST_NAME:
+        raise ValueError(
+            f"'{name[:20]}...' has {len(name)} characters; a name has at most {LONGEST_NAME}"
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(check_name)]
 
 S = TypeVar('S', bound=Settings)
 
@@ -37,18 +86,11 @@ def load_settings(model: type[S], path: str | Path) -> S:
     """
     Read a YAML file into `model`.
 
-    Raises SettingsError naming the file, the key and the valid values.
+    Raises SettingsError naming the file, the key, its line and the valid values.
     """
-    path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise SettingsError(f'{path}: cannot be read ({error.strerror})') from None
-    except UnicodeDecodeError:
-        raise SettingsError(f'{path}: not a text file; write YAML in UTF-8') from None
-    except yaml.YAMLError as error:
-        raise SettingsError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
-    return parse_settings(model, data if data is not None else {}, where=str(path))
+    document = read_yaml(path)
+    data = {} if document.data is None else document.data
+    return parse_settings(model, data, where=str(path), line_of=document.line_of)
 
 
 def load_bundled(model: type[S], folder: Path, name_or_path: str | Path, what: str) -> S:
@@ -58,7 +100,7 @@ def load_bundled(model: type[S], folder: Path, name_or_path: str | Path, what: s
     what: what it is, for the error. Raises SettingsError listing the names that there are.
     """
     path = Path(name_or_path)
-    if path.suffix in ('.yaml', '.yml'):
+    if path.suffix.lower() in ('.yaml', '.yml'):
         return load_settings(model, path)
     bundled = folder / f'{name_or_path}.yaml'
     if not bundled.is_file():
@@ -67,20 +109,51 @@ def load_bundled(model: type[S], folder: Path, name_or_path: str | Path, what: s
     return load_settings(model, bundled)
 
 
-def parse_settings(model: type[S], data: Any, where: str = 'settings') -> S:
-    """Validate a mapping into `model`. `where` starts each line of the error."""
+def parse_settings(
+    model: type[S],
+    data: Any,
+    where: str = 'settings',
+    line_of: Callable[[tuple], int | None] = lambda place: None,
+) -> S:
+    """
+    Validate a mapping into `model`.
+
+    where: starts each line of the error; line_of: of a key's place in the file, where there is
+    one.
+    """
     if not isinstance(data, dict):
         raise SettingsError(f'{where}: expected a mapping of keys, got {type(data).__name__}')
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        lines = [f'{where}: {_explain(model, item)}' for item in error.errors()]
+        lines = [
+            f'{where}: {_explain(model, item)}{_in_line(line_of(item["loc"]))}'
+            for item in _causes(error.errors())
+        ]
         raise SettingsError('\n'.join(lines)) from None
 
 
 def dump_settings(settings: Settings, path: str | Path) -> None:
     """Write settings as YAML that `load_settings` reads back to an equal object."""
-    Path(path).write_text(yaml.safe_dump(settings.model_dump(mode='json'), sort_keys=False))
+    write_yaml(settings.model_dump(mode='json'), path)
+
+
+def _causes(items: list[dict]) -> list[dict]:
+    """Leave out that a list is too short, where that is so because of its refused items."""
+    return [
+        item
+        for item in items
+        if item['type'] != 'too_short'
+        or not any(_is_inside(other['loc'], item['loc']) for other in items)
+    ]
+
+
+def _is_inside(place: tuple, outer: tuple) -> bool:
+    return len(place) > len(outer) and place[: len(outer)] == outer
+
+
+def _in_line(number: int | None) -> str:
+    return '' if number is None else f' [line {number}]'
 
 
 def _explain(model: type[Settings], item: dict) -> str:

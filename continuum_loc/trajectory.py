@@ -1,8 +1,4 @@
-"""
-Trajectories of a whole body: poses of the base and every ring over time.
-
-With TUM files and association to truth.
-"""
+"""Trajectories of a whole body: poses of base and rings over time, and their TUM files."""
 
 from __future__ import annotations
 

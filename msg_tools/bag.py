@@ -9,16 +9,21 @@ for topic, item in read_bag("run1"):
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+import re
 from typing import Any
 
 from continuum_loc.errors import BagError, MessageError
 from continuum_loc.measurements import NANOSECONDS
 from msg_tools.factory import bag_messages, deserialize, typestore
-from msg_tools.topics import cloud_topic_record, Topic, topic_spec, TOPICS, TRACKER
+from msg_tools.mcap import close_cut
+from msg_tools.topics import cloud_topic_record, INPUTS, Topic, topic_spec, TOPICS, TRACKER
 
+BAG_SUFFIXES = ('.mcap', '.db3')
 _CLOUDS = ('reconstruction', 'prior_map')
 
 
@@ -52,7 +57,9 @@ class BagWriter:
     """
     Writes a bag folder at `path` (which must not exist); use it as a context manager.
 
-    namespace: put before every relative topic, as a robot's namespace would.
+    namespace: put before every relative topic, as a robot's namespace would. Raises BagError where
+    it cannot be written, as on a full disk; `close` then saves what was written before, and
+    `counts` says how many messages of each topic that is.
     """
 
     def __init__(self, path: str | Path, namespace: str = '') -> None:
@@ -62,13 +69,12 @@ class BagWriter:
         if self.path.exists():
             raise BagError(f'{self.path}: exists already; give a new folder, or remove this one')
         self._root = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
+        self.counts: Counter[str] = Counter()
         self._connections: dict[str, Any] = {}
-        self._stamps: dict[str, int] = {}
         self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
-        try:
+        self._cut = False
+        with self._failing():
             self._writer.open()
-        except OSError as error:
-            raise BagError(f'{self.path}: cannot be written ({error.strerror})') from None
 
     def __enter__(self) -> BagWriter:
         return self
@@ -77,8 +83,44 @@ class BagWriter:
         self.close()
 
     def close(self) -> None:
-        """Write the bag's index. A bag that was not closed cannot be read."""
-        self._writer.close()
+        """Write the bag's index: one that was not closed has to be repaired before it is read."""
+        try:
+            if not self._cut:
+                with self._failing():
+                    self._writer.close()
+        finally:
+            if self._cut and self._writer.storage is not None:
+                self._save()
+
+    def flush(self) -> None:
+        """Hand what was written to the system, so that it outlives the process."""
+        storage = self._writer.storage
+        with self._failing():
+            if storage.chunk.bio.tell():
+                storage.close_chunk()
+            storage.bio.flush()
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._cut = True
+            raise BagError(f'{self.path}: cannot be written ({error.strerror})') from None
+
+    def _save(self) -> None:
+        """End the file after the last whole piece of it, and write metadata of what it holds."""
+        storage = self._writer.storage
+        with suppress(OSError):  # it still tries to write what it could not
+            storage.bio.close()
+        with self._failing():
+            left, self._writer.max_timestamp = close_cut(storage.path)
+        self.counts = Counter({topic: left[self._name(topic)] for topic in self.counts})
+        names = {connection.id: connection.topic for connection in self._connections.values()}
+        self._writer.counts = {number: left[name] for number, name in names.items()}
+        self._writer.storage = _Closed(storage.path)
+        with suppress(OSError):  # one file without metadata can be read too
+            self._writer.close()
 
     def write(self, topic: str, item: Any, stamp: int | None = None) -> None:
         """
@@ -99,16 +141,30 @@ class BagWriter:
 
         CDR with its 4-byte head.
         """
-        connection = self._connections.get(topic) or self._connect(topic)
-        self._writer.write(connection, stamp, data)
+        with self._failing():
+            connection = self._connections.get(topic) or self._connect(topic)
+            self._writer.write(connection, stamp, data)
+        self.counts[topic] += 1
+
+    def _name(self, topic: str) -> str:
+        return topic if topic.startswith('/') else self._root + topic
 
     def _connect(self, topic: str) -> Any:
         spec = topic_spec(topic)
-        name = topic if topic.startswith('/') else self._root + topic
         self._connections[topic] = self._writer.add_connection(
-            name, spec.type, typestore=typestore(), offered_qos_profiles=[_qos(spec)]
+            self._name(topic), spec.type, typestore=typestore(), offered_qos_profiles=[_qos(spec)]
         )
         return self._connections[topic]
+
+
+@dataclass(frozen=True)
+class _Closed:
+    """What stands for a file that has its end already."""
+
+    path: Path
+
+    def close(self, version: int, metadata: str) -> None:
+        """Nothing is left to write."""
 
 
 def read_bag(
@@ -139,11 +195,20 @@ def read_bag(
 
 
 def raw_messages(
-    path: str | Path, topics: tuple[str, ...] | None = None, namespace: str | None = None
+    path: str | Path,
+    topics: tuple[str, ...] | None = None,
+    namespace: str | None = None,
+    mistyped: Callable[[str, int, str], None] = lambda topic, count, text: None,
 ) -> Iterator[tuple[str, int, bytes]]:
-    """(relative topic, log time in ns, serialised message) of a bag, selected as by `read_bag`."""
+    """
+    (relative topic, log time in ns, serialised message) of a bag, selected as by `read_bag`.
+
+    mistyped: told of inputs by name that are of another type, which are left out.
+    """
     path = Path(path)
     with open_bag(path) as reader:
+        for stranger in _mistyped(reader.connections, namespace):
+            mistyped(*stranger)
         names = contract_topics(path, reader.connections, namespace)
         wanted = [
             c for c in reader.connections if c.topic in names and _selected(names[c.topic], topics)
@@ -171,15 +236,15 @@ def open_bag(path: Path) -> Iterator[Any]:
             'or an .mcap or .db3 file'
         )
     try:
-        reader = Reader(path)
+        reader = Reader(_storage_of(path))
         reader.open()
     except (
         Exception
     ) as error:  # damaged bytes come out of rosbags as all sorts of errors, MemoryError among them
         raise BagError(
             f'{path}: not a rosbag2 bag that can be read ({error or type(error).__name__}). '
-            'Valid: a folder with metadata.yaml, or one .mcap or .db3 file, '
-            'closed by its recorder; `mcap recover` mends a file that was cut off'
+            'Valid: a folder with metadata.yaml, or one .mcap or .db3 file, closed by its '
+            'recorder; `continuum-loc repair` (or `mcap recover`) mends one that was cut off'
         ) from None
     try:
         yield reader
@@ -187,22 +252,55 @@ def open_bag(path: Path) -> Iterator[Any]:
         reader.close()
 
 
+def _storage_of(path: Path) -> Path:
+    """Take the bag itself, or its one file where a killed recorder left no metadata."""
+    files = storage_files(path)
+    whole = path.is_file() or (path / 'metadata.yaml').is_file()
+    return path if whole or len(files) != 1 else files[0]
+
+
+def storage_files(path: Path) -> list[Path]:
+    """List the files of a bag that hold messages, in the order in which they were written."""
+    if path.is_file():
+        return [path]
+    found = [one for one in path.iterdir() if one.suffix in BAG_SUFFIXES]
+    return sorted(found, key=lambda one: [int(n) for n in re.findall(r'\d+', one.stem)[-1:]])
+
+
 def contract_topics(path: Path, connections: list, namespace: str | None) -> dict[str, str]:
-    """Absolute topic -> relative topic of the contract, for those which belong to one robot."""
+    """
+    Absolute topic -> relative topic of the contract, for those which belong to one robot.
+
+    namespace: the robot's; `/` for the one without; None or empty for the only one. Raises
+    BagError listing them where that does not tell.
+    """
     found: dict[str, dict[str, str]] = {}
     for connection in connections:
         split = split_topic(connection.topic, connection.msgtype)
         if split is not None:
             found.setdefault(split[0], {})[connection.topic] = split[1]
     shared = found.pop('*', {})
-    if namespace:
-        return found.get(namespace.strip('/'), {}) | shared
-    if len(found) > 1:
-        raise BagError(
-            f'{path}: holds several robots, choose one by its namespace: '
-            + ', '.join(f"'{name}'" for name in sorted(found))
-        )
-    return next(iter(found.values()), {}) | shared
+    if not namespace and len(found) < 2:
+        return next(iter(found.values()), {}) | shared
+    if namespace and namespace.strip('/') in found:
+        return found[namespace.strip('/')] | shared
+    listed = ', '.join(f"'{name or '/'}'" for name in sorted(found)) or 'none'
+    said = f"no robot '{namespace}' in it" if namespace else 'holds several robots'
+    raise BagError(f'{path}: {said}; choose one by its namespace: {listed}')
+
+
+def _mistyped(connections: list, namespace: str | None) -> Iterator[tuple[str, int, str]]:
+    """
+    Find inputs of one robot by name that are none by type.
+
+    Yields (relative topic, how many messages, what is wrong).
+    """
+    root = f'/{namespace.strip("/")}/' if namespace and namespace.strip('/') else '/'
+    for c in connections:
+        name = next((name for name in INPUTS if c.topic.endswith(f'/{name}')), '')
+        if name and c.topic.startswith(root) and c.msgtype != TOPICS[name].type:
+            expected = TOPICS[name].type
+            yield name, c.msgcount, f'{c.topic}: of type {c.msgtype}; the contract says {expected}'
 
 
 def split_topic(name: str, type_name: str) -> tuple[str, str] | None:
@@ -231,7 +329,8 @@ def _messages(path: Path, reader: Any, connections: list) -> Iterator[tuple[Any,
         yield from reader.messages(connections)
     except Exception as error:  # as in open_bag
         raise BagError(
-            f'{path}: damaged ({error or type(error).__name__}); `mcap recover` may mend it'
+            f'{path}: damaged ({error or type(error).__name__}); `continuum-loc repair` (or '
+            '`mcap recover`) saves what is whole'
         ) from None
 
 

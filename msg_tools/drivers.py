@@ -25,6 +25,9 @@ from continuum_loc.robot import TofModel
 import numpy as np
 
 USABLE = (TOF_VALID, *TOF_HALF_CONFIDENT)
+INT16, UINT16, UINT8 = (-(2**15), 2**15 - 1), (0, 2**16 - 1), (0, 2**8 - 1)
+REAL = (int, float, np.number)
+MOST_STRAIN = 0.1  # of a fibre, which breaks at half of that
 
 
 def vl53l5cx_frame(
@@ -45,16 +48,16 @@ def vl53l5cx_frame(
     reports the *perpendicular* distance. Its `flip_rows`, `flip_columns` undo the lens. stamp: ns
     of the exposure. A zone without a target becomes +inf, one with another status than 5, 6 or 9
     nan: its distance means nothing. Raises MessageError where the arrays do not fit the model's
-    grid.
+    grid, or hold what the sensor's registers cannot.
     """
     rays = model.directions
-    distance = 1e-3 * _per_zone(distance_mm, 'distance_mm', len(rays))
-    status = _per_zone(target_status, 'target_status', len(rays)).astype(np.uint8)
+    distance = 1e-3 * _raw(distance_mm, 'distance_mm', len(rays), INT16)
+    status = _raw(target_status, 'target_status', len(rays), UINT8).astype(np.uint8)
     along = distance / rays[:, 0] if model.convention == 'perpendicular' else distance
     seen = np.isin(status, USABLE) & (distance > 0.0)
     none = status == TOF_NO_TARGET
     if nb_target_detected is not None:
-        none |= _per_zone(nb_target_detected, 'nb_target_detected', len(rays)) == 0
+        none |= _raw(nb_target_detected, 'nb_target_detected', len(rays), UINT8) == 0
     ranges = np.where(none, np.inf, np.where(seen, along, np.nan))
     ranges = np.where(np.isfinite(ranges) & (ranges < model.min_range), -np.inf, ranges)
     valid = np.isfinite(ranges)
@@ -62,9 +65,8 @@ def vl53l5cx_frame(
     if range_sigma_mm is None:
         sigma = np.full(len(rays), np.nan)
     else:
-        sigma = np.where(
-            valid, 1e-3 * _per_zone(range_sigma_mm, 'range_sigma_mm', len(rays)), np.nan
-        )
+        stated = 1e-3 * _raw(range_sigma_mm, 'range_sigma_mm', len(rays), UINT16)
+        sigma = np.where(valid, stated, np.nan)
     return TofFrame(stamp, sensor, points, ranges, sigma, status)
 
 
@@ -79,12 +81,12 @@ def ism330_sample(
     """
     Make an IMU sample from the ISM330's (or LSM6's) raw registers.
 
-    By the sensitivities of its data sheet.
-
-    At +-500 dps the gyro's is 17.50 mdps per LSB, at +-4 g the accelerometer's 0.122 mg per LSB.
+    The sensitivities are those of its data sheet: at +-500 dps 17.50 mdps per LSB of the gyro, at
+    +-4 g 0.122 mg per LSB of the accelerometer. Raises MessageError for what are no three signed
+    numbers of 16 bits.
     """
-    rate = np.radians(1e-3 * gyro_mdps_per_lsb * _per_zone(gyro_raw, 'gyro_raw', 3))
-    force = 9.80665e-3 * accel_mg_per_lsb * _per_zone(accel_raw, 'accel_raw', 3)
+    rate = np.radians(1e-3 * gyro_mdps_per_lsb * _raw(gyro_raw, 'gyro_raw', 3, INT16))
+    force = 9.80665e-3 * accel_mg_per_lsb * _raw(accel_raw, 'accel_raw', 3, INT16)
     return ImuSample(stamp, sensor, rate, force)
 
 
@@ -103,27 +105,55 @@ def fbg_sample(
     and leaves out temperature and tension. The bending plane theta is the direction towards which
     the backbone curves, from body y towards z.
     """
-    strains, azimuth = (
-        np.atleast_2d(np.asarray(strains, float)),
-        np.radians(np.asarray(core_azimuth_deg, float)),
-    )
-    if len(azimuth) < 3 or strains.shape != (len(s), len(azimuth)):
+    strains, azimuth = np.atleast_2d(_numbers(strains, 'strains')), np.radians(core_azimuth_deg)
+    s = _numbers(s, 's')
+    if len(azimuth) < 3 or s.ndim != 1 or strains.shape != (len(s), len(azimuth)) or not len(s):
         raise MessageError(
             'size',
-            f'fbg: strains of shape {strains.shape} for {len(s)} stations and {len(azimuth)} '
+            f'fbg: strains of shape {strains.shape} for {s.size} stations and {len(azimuth)} '
             'cores; valid: stations x cores, at least 3 cores',
         )
-    if not np.isfinite(strains).all():
-        raise MessageError('value', 'fbg: a strain is not finite')
+    if np.abs(strains).max() > MOST_STRAIN:
+        raise MessageError(
+            'value',
+            f'fbg: a strain of {np.abs(strains).max():.3g}; valid: up to {MOST_STRAIN}, without a '
+            'unit (microstrain?)',
+        )
     cores = np.column_stack(
         [-core_radius * np.cos(azimuth), -core_radius * np.sin(azimuth), np.ones(len(azimuth))]
     )
     y, z, _ = np.linalg.lstsq(cores, strains.T, rcond=None)[0]
-    return StrainSample(stamp, np.asarray(s, float), np.arctan2(z, y), np.hypot(y, z))
+    return StrainSample(stamp, s, np.arctan2(z, y), np.hypot(y, z))
 
 
-def _per_zone(values: Any, name: str, count: int) -> np.ndarray:
-    array = np.asarray(values, float).reshape(-1)
+def _raw(values: Any, name: str, count: int, limits: tuple[int, int]) -> np.ndarray:
+    """(count,) whole numbers within the limits of their register."""
+    array = _numbers(values, name).reshape(-1)
     if len(array) != count:
         raise MessageError('size', f'{name}: {len(array)} values; valid: {count}')
+    odd = (array < limits[0]) | (array > limits[1]) | (array % 1.0 != 0.0)
+    if odd.any():
+        value = array[odd][0]
+        unsigned = limits == INT16 and 2**15 <= value < 2**16 and value % 1.0 == 0.0
+        raise MessageError(
+            'value',
+            f'{name}: {value:.15g}'
+            + (f' (is {value - 2**16:.0f} meant, read without its sign?)' if unsigned else '')
+            + f'; valid: whole numbers from {limits[0]} to {limits[1]}',
+        )
+    return array
+
+
+def _numbers(values: Any, name: str) -> np.ndarray:
+    array = values if isinstance(values, np.ndarray) else np.array(values, object)
+    if array.dtype == object:
+        odd = [v for v in array.flat if isinstance(v, bool) or not isinstance(v, REAL)]
+        if odd:
+            raise MessageError('value', f'{name}: holds {str(odd[0])[:40]!r}, which is no number')
+    try:
+        array = array.astype(float)
+    except OverflowError:
+        raise MessageError('value', f'{name}: holds a number beyond all limits') from None
+    if not np.isfinite(array).all():
+        raise MessageError('value', f'{name}: holds a value that is not finite')
     return array

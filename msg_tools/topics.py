@@ -16,7 +16,7 @@ from continuum_loc.measurements import (
     TrackedPose,
     TruthSample,
 )
-from msg_tools import convert
+from msg_tools import convert, results
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, PosesRecord, TipRecord
 
@@ -47,11 +47,11 @@ def _read(decode: Callable[[Any, str], Any]) -> Callable[[Any, int | None, str],
 
 def _poses(make: Messages, item: Any) -> Any:
     T = item.T_map_body if isinstance(item, PosesRecord) else item.T_map_ring
-    return convert.poses_message(make, item.stamp, T)
+    return results.poses_message(make, item.stamp, T)
 
 
 def _path(make: Messages, item: Any) -> Any:
-    return convert.path_message(make, item.stamp, item.T_map_backbone)
+    return results.path_message(make, item.stamp, item.T_map_backbone)
 
 
 def tip_of(estimate: Any) -> TipRecord:
@@ -100,31 +100,31 @@ TOPICS: dict[str, Topic] = {
         depth=256,
     ),
     'ground_truth/poses': Topic(
-        'geometry_msgs/msg/PoseArray', _poses, _read(convert.truth_sample), depth=512
+        'geometry_msgs/msg/PoseArray', _poses, _read(results.truth_sample), depth=512
     ),
-    'poses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(convert.poses_record)),
-    'backbone': Topic('nav_msgs/msg/Path', _path, _read(convert.path_record)),
+    'poses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(results.poses_record)),
+    'backbone': Topic('nav_msgs/msg/Path', _path, _read(results.path_record)),
     'tip': Topic(
         'nav_msgs/msg/Odometry',
-        lambda make, item: convert.tip_message(make, tip_of(item), 'tip'),
-        _read(convert.tip_record),
+        lambda make, item: results.tip_message(make, tip_of(item), 'tip'),
+        _read(results.tip_record),
     ),
     'reconstruction': Topic(
-        'sensor_msgs/msg/PointCloud2', convert.columns_message, _read(convert.cloud_record)
+        'sensor_msgs/msg/PointCloud2', results.columns_message, _read(results.cloud_record)
     ),
     'prior_map': Topic(
         'sensor_msgs/msg/PointCloud2',
-        convert.columns_message,
-        _read(convert.cloud_record),
+        results.columns_message,
+        _read(results.cloud_record),
         latched=True,
         depth=1,
     ),
-    'shape/poses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(convert.poses_record)),
-    'shape/curve': Topic('nav_msgs/msg/Path', _path, _read(convert.path_record)),
+    'shape/poses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(results.poses_record)),
+    'shape/curve': Topic('nav_msgs/msg/Path', _path, _read(results.path_record)),
     '/diagnostics': Topic(
         'diagnostic_msgs/msg/DiagnosticArray',
-        convert.diagnostics_message,
-        _read(convert.diagnostics_record),
+        results.diagnostics_message,
+        _read(results.diagnostics_record),
     ),
 }
 
@@ -185,7 +185,7 @@ def cloud_topic_record(item: Any, stamp: int) -> CloudRecord:
     if isinstance(item, CloudRecord):
         return item
     if hasattr(item, 'normals'):
-        return convert.map_record(stamp, item)
+        return results.map_record(stamp, item)
     x, y, z = item.points.T
     return CloudRecord(
         stamp,

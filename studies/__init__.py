@@ -17,11 +17,14 @@ import difflib
 import importlib
 from pathlib import Path
 import pkgutil
+from typing import TYPE_CHECKING
 
 from continuum_loc.errors import StudyError
-from continuum_loc.offline.claims import Claim
 
-StudyRun = Callable[[Path, bool, int, int], list[Claim]]
+if TYPE_CHECKING:
+    from continuum_loc.offline.claims import Claim
+
+StudyRun = Callable[[Path, bool, int, int], 'list[Claim]']
 
 
 def study_names() -> list[str]:

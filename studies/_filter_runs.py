@@ -14,17 +14,19 @@ import re
 import traceback
 from typing import Any
 
+from continuum_loc.closure import is_ours
 from continuum_loc.estimate import Estimate
-from continuum_loc.estimator.settings import EstimatorSettings, load_estimator_settings
+from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import Measurement, NANOSECONDS, nanoseconds, TruthSample
-from continuum_loc.offline.claims import Claim, write_json
+from continuum_loc.offline.as_json import write_json
+from continuum_loc.offline.localise import make_filter, trial_settings
 from continuum_loc.offline.metrics import Errors, errors
 from continuum_loc.offline.replay import Filter, replay, samples_of
 from continuum_loc.offline.runs import load_run, Run, save_run
 from continuum_loc.offline.source import replay_digest
-from continuum_loc.offline.tables import markdown
-from continuum_loc.offline.trials import configuration, make_filter, scene_map_file, Trial
+from continuum_loc.offline.trial_runs import configuration, trial_map_file
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import parse_settings
 from continuum_loc.simulator.faults import Fault
@@ -116,6 +118,10 @@ class Witness:
         """Pass the end on."""
         return self._note(self.watched.flush())
 
+    def reset(self) -> None:
+        """Pass a new start on."""
+        self.watched.reset()
+
     def _note(self, estimate: Estimate | None) -> Estimate | None:
         if estimate is not None:
             self.log.append(
@@ -129,11 +135,7 @@ class Witness:
 
 
 def run_cases(cases: Sequence[Case], out: Path, jobs: int) -> list[CaseResult]:
-    """
-    Simulate the recordings and replay the cases that `out` does not hold yet.
-
-    Results are in the order of `cases`.
-    """
+    """Results in the order of `cases`; what `out` does not hold yet is simulated and replayed."""
     failed = record_bags([case.trial for case in cases], out, jobs)
     todo = [(out, case) for case in cases if case.trial.recording not in failed]
     problems = dict(show_progress(parallel(replay_case, todo, jobs), len(todo), 'estimating'))
@@ -164,8 +166,8 @@ def replay_case(out: Path, case: Case) -> tuple[str, str]:
 def _replay(out: Path, case: Case, folder: Path) -> None:
     trial, settings = case.trial, case_settings(case)
     resolved = configuration(trial, estimator=settings, case=case, faults=repr(case.faults))
-    bag, map_file = bag_of(out, trial), scene_map_file(trial.map_scene or trial.scene)
-    key = configuration_digest(resolved, replay_digest(), made_by(bag), map_file.name)
+    bag, map_file = bag_of(out, trial), trial_map_file(trial)
+    key = configuration_digest(resolved, code_of(case), made_by(bag), map_file.name)
     if _digest(folder) == key:
         return
     witness = Witness(make_filter(load_robot(trial.robot), load_map(map_file), settings))
@@ -182,6 +184,12 @@ def _replay(out: Path, case: Case, folder: Path) -> None:
     write_json(folder / 'diagnostics.json', witness.log)
 
 
+def code_of(case: Case) -> str:
+    """Digest the code that decides a case: kinds of faults may come from any module of ours."""
+    kinds = {type(fault).__module__ for fault in case.faults}
+    return replay_digest(__name__, *sorted(name for name in kinds if is_ours(name)))
+
+
 def _digest(folder: Path) -> str | None:
     files = [folder / 'summary.json', folder / 'diagnostics.json']
     return (
@@ -192,12 +200,8 @@ def _digest(folder: Path) -> str | None:
 
 
 def case_settings(case: Case) -> EstimatorSettings:
-    """
-    Return the settings that come with the robot, changed as the case says.
-
-    Raises SettingsError.
-    """
-    data = load_estimator_settings(load_robot(case.trial.robot).name).model_dump()
+    """Change the settings that come with the robot as the case says. Raises SettingsError."""
+    data = trial_settings(case.trial).model_dump()
     for section, value in case.changes.items():
         data[section] = {**data[section], **value} if isinstance(value, dict) else value
     return parse_settings(EstimatorSettings, data, where=case.name)
@@ -272,11 +276,7 @@ def longest_stretch(times: np.ndarray, flags: np.ndarray) -> float:
 
 
 def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
-    """
-    Find the first of `times` (K,) from which on `flags` (K,) stay true.
-
-    inf where the last one is false.
-    """
+    """Find the first of `times` (K,) from which on `flags` (K,) stay true, or inf."""
     wrong = np.flatnonzero(~flags)
     if len(wrong) == 0:
         return float(times[0])
@@ -286,32 +286,3 @@ def settled_since(times: np.ndarray, flags: np.ndarray) -> float:
 def failures(results: Sequence[CaseResult]) -> dict[str, str]:
     """List the cases that gave nothing, and why."""
     return {result.case.folder: result.error for result in results if result.run is None}
-
-
-def write_page(
-    out: Path,
-    title: str,
-    text: str,
-    claims: Sequence[Claim],
-    tables: dict[str, Sequence[dict[str, Any]]],
-) -> Path:
-    """Write `out/study.md`: the explanation, the claims (those that fail first) and the tables."""
-    import pandas as pd
-
-    rows = [
-        {
-            'claim': claim.name,
-            'value': f'{claim.value:.4g} {claim.unit}'.strip(),
-            'bound': claim.bound,
-            'holds': claim.holds,
-        }
-        for claim in sorted(claims, key=lambda claim: claim.holds)
-    ]
-    parts = [f'# {title}', text, '## Claims', markdown(pd.DataFrame(rows))]
-    for name, table in tables.items():
-        if not table:
-            continue
-        parts += [f'## {name}', markdown(pd.DataFrame(list(table)))]
-    path = out / 'study.md'
-    path.write_text('\n\n'.join(part.rstrip() for part in parts) + '\n')
-    return path

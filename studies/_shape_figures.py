@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from continuum_loc.shape import curves
 import numpy as np
+from studies.support.shape_curves import at_fractions
 
 TITLES = {
     'quadratic_bezier': 'Quadratic Bezier pieces',
@@ -91,7 +91,7 @@ def _error_panel(
 ) -> None:
     fractions = np.linspace(0.0, 1.0, len(groove['truth']))
     error = 1e3 * np.linalg.norm(
-        curves.at_fractions(groove[key][method], fractions) - groove['truth'], axis=1
+        at_fractions(groove[key][method], fractions) - groove['truth'], axis=1
     )
     axis.plot(75.0 * fractions, error, color=colour, label=f'{label}, MAE {error.mean():.3f} mm')
 

@@ -7,6 +7,7 @@ Every map with every scene that differs by one object.
 from __future__ import annotations
 
 from continuum_loc.offline.trials import Trial
+from studies.support.worlds import DISTURBED, IDEAL, WORLDS
 
 # 23 trajectories over five scenes, at least four in each; with the 13 pairs below that makes 61
 # combinations. The last one in R1, R2 and R3 swings the arm against what stands there.
@@ -22,13 +23,29 @@ MATCHING = tuple((f'R{k}', f'R{k}') for k in range(5))
 ADDED = tuple((f'R{k}', f'R{k + 1}') for k in range(4))
 REMOVED = tuple((f'R{k + 1}', f'R{k}') for k in range(4))
 # `paper`: one ray per zone. `vl53l5cx`: the sensor as it is, with mounting errors, clock offset
-# and gyro bias.
-FIDELITIES = ('paper', 'vl53l5cx')
+# and gyro bias. `disturbed`: the world of that name, its sensors among all that departs.
+CONDITIONS = {
+    'paper': {},
+    'vl53l5cx': {'fidelity': 'vl53l5cx', 'disturbed': True},
+    'disturbed': {'world': DISTURBED},
+}
+
+
+def conditions() -> tuple[str, ...]:
+    """Names of the conditions in the worlds that are asked for."""
+    return tuple(
+        name for name, told in CONDITIONS.items() if told.get('world', IDEAL) in WORLDS.get()
+    )
+
+
+def condition(trial: Trial) -> str:
+    """Name the condition of a trial."""
+    return DISTURBED if trial.world == DISTURBED else trial.fidelity
 
 
 def soft_arm_trials(quick: bool, seed: int) -> list[Trial]:
     """
-    All 61 combinations in both fidelities.
+    All 61 combinations in every condition.
 
     `quick`: four seconds of one trajectory, one pair of each kind.
     """
@@ -39,12 +56,11 @@ def soft_arm_trials(quick: bool, seed: int) -> list[Trial]:
                 scene,
                 'b2',
                 map_scene,
-                fidelity=fidelity,
-                disturbed=fidelity != 'paper',
+                **CONDITIONS[name],
                 seed=seed,
                 duration=4.0,
             )
-            for fidelity in FIDELITIES
+            for name in conditions()
             for map_scene, scene in (MATCHING[1], ADDED[0], REMOVED[1])
         ]
     # Every scene and trajectory has noise of its own: equal names of trajectories are no equal
@@ -56,11 +72,10 @@ def soft_arm_trials(quick: bool, seed: int) -> list[Trial]:
             trajectory,
             map_scene,
             profile='full',
-            fidelity=fidelity,
-            disturbed=fidelity != 'paper',
+            **CONDITIONS[name],
             seed=seed + 10 * int(scene[1:]) + number,
         )
-        for fidelity in FIDELITIES
+        for name in conditions()
         for map_scene, scene in MATCHING + ADDED + REMOVED
         for number, trajectory in enumerate(TRAJECTORIES[scene])
     ]

@@ -16,9 +16,10 @@ from studies._filter_runs import (
     longest_unannounced,
     run_cases,
     settled_since,
-    write_page,
 )
+from studies._pages import write_page
 from studies.support.split import HOLD_OUT, require_unseen
+from studies.support.worlds import by_world, column, in_worlds, told
 
 NO_STRAIN = {'strain': {'enabled': False}}
 NO_GYRO = {'gyro': {'enabled': False}}
@@ -87,15 +88,14 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     results = run_cases(cases, out, jobs)
     warm = [result for result in results if result.case.name in VARIANTS]
     cold = [result for result in results if result.case.name in COLD]
-    claims = judge(warm, cold)
-    tables = {
-        'ablation': variant_rows([result for result in warm if as_mapped(result)]),
-        'ablation_changed_scene': variant_rows(
-            [result for result in warm if not as_mapped(result)]
-        ),
-        'ablation_trials': [trial_row(result) for result in warm if result.run],
-        'cold_starts': [cold_row(result) for result in cold if result.run],
-    }
+    claims: list[Claim] = []
+    tables: dict[str, list[dict[str, Any]]] = {}
+    for world, members in by_world(results, lambda one: one.case.trial).items():
+        ours = set(map(id, members))
+        begun, bent = ([one for one in kind if id(one) in ours] for kind in (warm, cold))
+        claims += told(judge(begun, bent), world)
+        for name, rows in tables_of(begun, bent).items():
+            tables[name] = tables.get(name, []) + column(rows, world)
     write_study(
         out,
         claims,
@@ -118,6 +118,20 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     return claims
 
 
+def tables_of(
+    warm: Sequence[CaseResult], cold: Sequence[CaseResult]
+) -> dict[str, list[dict[str, Any]]]:
+    """Tabulate the variants by whether the map is the scene's own, the trials, the cold starts."""
+    return {
+        'ablation': variant_rows([result for result in warm if as_mapped(result)]),
+        'ablation_changed_scene': variant_rows(
+            [result for result in warm if not as_mapped(result)]
+        ),
+        'ablation_trials': [trial_row(result) for result in warm if result.run],
+        'cold_starts': [cold_row(result) for result in cold if result.run],
+    }
+
+
 def warm_cases(quick: bool, seed: int) -> list[Case]:
     """
     Every variant from the start of two trials.
@@ -126,7 +140,8 @@ def warm_cases(quick: bool, seed: int) -> list[Case]:
     """
     if quick:
         return [
-            Case(name, Trial(trajectory='t2', seed=seed, duration=6.0), VARIANTS[name], end=4.0)
+            Case(name, trial, VARIANTS[name], end=4.0)
+            for trial in in_worlds([Trial(trajectory='t2', seed=seed, duration=6.0)])
             for name in QUICK
         ]
     changed = Trial(scene='S9', trajectory='t2', map_scene='S0', seed=seed)
@@ -134,25 +149,22 @@ def warm_cases(quick: bool, seed: int) -> list[Case]:
     return [
         Case(name, trial, changes)
         for name, changes in VARIANTS.items()
-        for trial in [*trials, *[changed] * (name in AGAINST_THE_MAP)]
+        for trial in in_worlds([*trials, *[changed] * (name in AGAINST_THE_MAP)])
     ]
 
 
 def cold_cases(quick: bool, seed: int) -> list[Case]:
-    """
-    Start in the middle of a recording, where the robot is bent and moves.
-
-    The base is all that is known.
-    """
+    """Start in mid-recording, bent and moving, with nothing known but the base."""
     if quick:
         return [
-            Case('cold', Trial(trajectory='t2', seed=seed, duration=6.0), COLD['cold'], start=4.6)
+            Case('cold', trial, COLD['cold'], start=4.6)
+            for trial in in_worlds([Trial(trajectory='t2', seed=seed, duration=6.0)])
         ]
     trials = [Trial(trajectory=name, seed=seed) for name in ('t2', 't3')]
     return [
         Case(name, trial, changes, start, start + COLD_LENGTH)
         for name, changes in COLD.items()
-        for trial in trials
+        for trial in in_worlds(trials)
         for start in COLD_STARTS
     ]
 

@@ -1,8 +1,4 @@
-"""
-Scene reconstruction and anomalies, from what the trials of Table II saw.
-
-Against the true meshes and known anomalies.
-"""
+"""Reconstruction and anomalies from what the trials of Table II saw, beside the true meshes."""
 
 from __future__ import annotations
 
@@ -14,7 +10,8 @@ from continuum_loc.measurements import NANOSECONDS, TofFrame
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.replay import samples_of
 from continuum_loc.offline.runs import load_run
-from continuum_loc.offline.trials import scene_map, Trial
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.scene.anomalies import (
     AnomalyCluster,

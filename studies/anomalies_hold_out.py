@@ -13,11 +13,15 @@ from studies.table2 import TRAJECTORIES
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     """Run the `anomalies` study on the hold-out (`quick`: six seconds in one scene)."""
-    members = [
+    return run_scenes(out, out / 'anomalies', trials(quick, seed), seed, jobs, tuning=True)
+
+
+def trials(quick: bool, seed: int) -> list[Trial]:
+    """Three trials in each scene of the hold-out, all with the map of S0."""
+    if quick:
+        return [Trial('engine', 'H3', 't2', 'S0', seed=seed, duration=6.0)]
+    return [
         Trial('engine', scene, trajectory, 'S0', profile='full', seed=seed)
         for scene in DETECTOR_HOLD_OUT
         for trajectory in TRAJECTORIES
     ]
-    if quick:
-        members = [Trial('engine', 'H3', 't2', 'S0', seed=seed, duration=6.0)]
-    return run_scenes(out, out / 'anomalies', members, seed, jobs, tuning=True)

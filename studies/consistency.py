@@ -18,9 +18,10 @@ from continuum_loc.offline.runs import load_run, settled
 from continuum_loc.offline.trials import Trial
 from continuum_loc.trajectory import Trajectory
 import numpy as np
-from studies._filter_runs import write_page
+from studies._pages import write_page
 from studies.support.campaign import run_campaign
 from studies.support.split import HOLD_OUT, require_unseen
+from studies.support.worlds import column, in_worlds, told
 
 NEES = (0.7, 1.5)
 COVERAGE = (0.90, 0.98)
@@ -44,24 +45,25 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
     `quick`: six seconds of one.
     """
-    wanted = trials(quick, seed)
+    wanted = in_worlds(trials(quick, seed))
     require_unseen(wanted)
     outcomes = run_campaign(wanted, out, jobs)
     claims, rings, components, speeds = [], [], [], []
-    for robot in dict.fromkeys(trial.robot for trial in wanted):
-        members = [one for one in outcomes if one.trial.robot == robot and one.summary is not None]
+    for world, robot in dict.fromkeys((trial.world, trial.robot) for trial in wanted):
+        members = [
+            one.trial
+            for one in outcomes
+            if (one.trial.world, one.trial.robot) == (world, robot) and one.summary is not None
+        ]
         if not members:
             continue
-        found, speed = pooled(out, [one.trial for one in members])
-        claims += judge(robot, found)
-        rings += [
-            {'robot': robot, 'ring': name, **honesty(found, ring)} for name, ring in columns(found)
-        ]
-        components += [
-            {'robot': robot, 'ring': name, **component_row(found, ring)}
-            for name, ring in columns(found)
-        ]
-        speeds += speed_rows(robot, found, speed)
+        found, speed = pooled(out, members)
+        claims += told(judge(robot, found), world)
+        for name, ring in columns(found):
+            label = {'robot': robot, 'ring': name}
+            rings += column([{**label, **honesty(found, ring)}], world)
+            components += column([{**label, **component_row(found, ring)}], world)
+        speeds += column(speed_rows(robot, found, speed), world)
     claims.append(
         at_most('trials that failed', sum(one.summary is None for one in outcomes), '', 0)
     )

@@ -10,18 +10,16 @@ A fault lasts from START for LENGTH seconds. Each case is judged beside the same
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from continuum_loc.measurements import TofFrame
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.faults import ClockOffset, Dropout, Fault, Freeze, Outliers
 import numpy as np
-from scipy.spatial.transform import Rotation
 from studies._filter_runs import (
     Case,
     CaseResult,
@@ -29,33 +27,17 @@ from studies._filter_runs import (
     OFF,
     run_cases,
     settled_since,
-    write_page,
 )
+from studies._pages import write_page
+from studies._turned import Turned
 from studies.support.split import require_unseen
+from studies.support.worlds import by_world, column, in_worlds, told
 
 START, LENGTH, AFTER = 8.0, 2.0, 3.0  # s
 QUICK_START = 1.5  # s
 BACK = 1.0  # s: the limit for being back to normal
 NORMAL_MARGIN = 1.25
 CLEAN = 'no fault'
-
-
-@dataclass(frozen=True, kw_only=True)
-class Turned(Fault):
-    """
-    A ToF sensor knocked out of its mount.
-
-    Its points belong `angle_deg` away, about its z axis, from where the robot description puts
-    them.
-    """
-
-    angle_deg: float = 20.0
-
-    def alter(self, sample, rng, memory):
-        if not isinstance(sample, TofFrame):
-            return sample
-        turn = Rotation.from_euler('z', self.angle_deg, degrees=True)
-        return replace(sample, points=turn.apply(sample.points))
 
 
 @dataclass(frozen=True)
@@ -100,25 +82,31 @@ beside the least share of fitting samples of each kind of sensor.
 
 
 def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
-    """
-    Inject every fault into trials that no number was tuned on.
-
-    `quick`: two faults in one short trial.
-    """
+    """Inject every fault into trials that no number was tuned on; `quick`: two faults into one."""
     cases = fault_cases(quick, seed)
     require_unseen([case.trial for case in cases])
     results = run_cases(cases, out, jobs)
     clean = {result.case.trial: result for result in results if result.case.name == CLEAN}
-    rows = [
-        fault_row(result, clean[result.case.trial])
-        for result in results
-        if result.run and clean[result.case.trial].run and result.case.name != CLEAN
-    ]
-    claims = judge(rows, len(failures(results)))
-    healthy = [clean_row(result) for result in clean.values() if result.run]
-    claims.append(
-        at_most('clean runs: sensors accused', sum(row['accused'] for row in healthy), '', 0)
-    )
+    claims, rows, healthy = [], [], []
+    for world, members in by_world(results, lambda one: one.case.trial).items():
+        found = [
+            fault_row(result, clean[result.case.trial])
+            for result in members
+            if result.run and clean[result.case.trial].run and result.case.name != CLEAN
+        ]
+        whole = [
+            clean_row(result) for result in members if result.case.name == CLEAN and result.run
+        ]
+        accused = sum(row['accused'] for row in whole)
+        claims += told(
+            [
+                *judge(found, len(failures(members))),
+                at_most('clean runs: sensors accused', accused, '', 0),
+            ],
+            world,
+        )
+        rows += column(found, world)
+        healthy += column(whole, world)
     write_study(
         out,
         claims,
@@ -145,7 +133,7 @@ def fault_cases(quick: bool, seed: int) -> list[Case]:
     end = start + LENGTH + (1.5 if quick else AFTER)
     return [
         case
-        for trial in trials
+        for trial in in_worlds(trials)
         for case in (
             Case(CLEAN, trial, end=end),
             *(Case(one.name, trial, end=end, faults=(one.at(start),)) for one in wanted),
@@ -260,11 +248,7 @@ def accused(result: CaseResult, fault: Fault) -> set[str]:
 
 
 def named_at(result: CaseResult, fault: Fault, name: str) -> float:
-    """
-    Time [s] from the fault's start until `name` is suspected or no longer heard.
-
-    inf where it never is.
-    """
+    """Time [s] from the fault's start until `name` is suspected or no longer heard, else inf."""
     steps = [
         step
         for step in noticed(result, fault)

@@ -106,11 +106,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def data_folder() -> Path:
-    """
-    Find the folder of the trials.
-
-    Raises StudyError saying how to name it.
-    """
+    """Find the folder of the trials. Raises StudyError, which says how to name it."""
     named = os.environ.get(DATA)
     if not named:
         raise StudyError(
@@ -132,9 +128,9 @@ def estimates(
     span: tuple[float, float] = (-np.inf, np.inf),
 ) -> tuple[list[Estimate], list[Estimate], list[float]]:
     """
-    Newest and lagged estimates of the measurements in `span`, and the time of each step [ms].
+    Newest and lagged estimates, and the time of each step [ms].
 
-    `span` is in seconds of the trial.
+    span: what part of the measurements is used, in seconds of the trial.
     """
     newest, lagged, step_ms = [], [], []
     for sample in recording.measurements:
@@ -158,7 +154,7 @@ def disc_errors(
     """
     Errors by disc at the stamps of motion capture in `window` [s].
 
-    Covariances are those of the next estimate.
+    The covariance at a stamp is that of the estimate that follows it.
     """
     ordered = sorted(
         {estimate.stamp: estimate for estimate in made}.values(),
@@ -275,11 +271,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def judge(rows: list[dict]) -> list[Claim]:
-    """
-    Every disc's RMSE is no more than the C++ code's, nor than Hermite's.
-
-    The latter are also what was published.
-    """
+    """Claim that no disc's RMSE exceeds the C++ code's, nor that of a Hermite curve."""
     claims = []
     for row in rows:
         name = f'{row["trial"]}, {row["disc"]}, {row["state"]}'

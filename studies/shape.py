@@ -16,8 +16,9 @@ from typing import Any
 from continuum_loc.measurements import FieldSample, ImuSample, TruthSample
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.robot import load_robot, RobotDescription
-from continuum_loc.shape import curves, ShapeEstimate, ShapeEstimator, ShapeSettings
+from continuum_loc.shape import ShapeEstimate, ShapeEstimator, ShapeSettings
 from continuum_loc.shape.calibration import calibrate, Calibration, nominal_calibration
+from continuum_loc.shape.curves import CurveMethod, fit_curve
 from continuum_loc.simulator.hall_arm import (
     Arm,
     bent,
@@ -29,18 +30,20 @@ from continuum_loc.simulator.hall_arm import (
     s_shape,
 )
 import numpy as np
+from studies.support.shape_curves import at_fractions, fit_projected
 from studies.support.shape_paper import Background, MENDS, paper_pipeline, PaperEstimate
 
 SPAN = 0.075  # m, from the magnet to the last module: what the paper's curves cover of the robot
 SAMPLES = 301  # points along a curve: the polyline's own error stays below a tenth of a micrometre
 FRACTIONS = np.linspace(0.0, 1.0, 151)
-METHODS: tuple[curves.CurveMethod, ...] = ('quadratic_bezier', 'cubic_bezier', 'kasa_arc')
+METHODS: tuple[CurveMethod, ...] = ('quadratic_bezier', 'cubic_bezier', 'kasa_arc')
 PAPER_MAE = {'straight': 0.02, '160 mm': 0.70, '80 mm': 0.84}  # mm, arc
 ARC_LIMIT = {'straight': 0.02, '160 mm': 0.35, '80 mm': 0.42}  # mm, arc, with calibration
 # Bending about the IMU's x axis, which is roll in eq. 3, is the plane in which print errs least.
 PLANES = {'roll': -90.0, 'between': 45.0, 'pitch': 0.0}  # azimuth [deg]
 
-_fit = partial(curves.fit_curve, samples=SAMPLES)
+_fit = partial(fit_curve, samples=SAMPLES)
+_project = partial(fit_projected, samples=SAMPLES)
 
 Sample = ImuSample | FieldSample
 Row = dict[str, Any]
@@ -203,14 +206,14 @@ def _both_forms(
 ) -> list[Row]:
     return [
         _row(
-            _fit(points, tangents, method, projected),
+            fit(points, tangents, method),
             truth,
             curve=method,
-            form='projected' if projected else 'spatial',
+            form=form,
             **labels,
         )
         for method in METHODS
-        for projected in (True, False)
+        for form, fit in (('projected', _project), ('spatial', _fit))
     ]
 
 
@@ -283,7 +286,7 @@ def points_and_tangents(
 
 def errors(curve: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """(151,) mm between the curve and the truth at equal fractions of their lengths."""
-    return 1e3 * np.linalg.norm(curves.at_fractions(curve, FRACTIONS) - truth, axis=1)
+    return 1e3 * np.linalg.norm(at_fractions(curve, FRACTIONS) - truth, axis=1)
 
 
 def _row(points: np.ndarray, truth: np.ndarray, /, **labels: Any) -> Row:

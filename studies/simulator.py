@@ -283,11 +283,7 @@ def first_mode(links: int, time_step: float, duration: float = 8.0) -> dict[str,
 
 
 def _released(model: Any, duration: float) -> np.ndarray:
-    """
-    Record the tip's y [m] at every step after the load is gone.
-
-    What damping remains is the integrator's.
-    """
+    """Record the tip's y [m] after the load is gone, where the integrator alone damps it."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -424,12 +420,6 @@ def _mechanism_claims(found: dict[str, float]) -> Iterator[Claim]:
         found['wide'],
         '',
         1.0,
-    )
-    yield at_most(
-        'VL53L5CX status 12 away from bright neighbours: share of zones',
-        found['falsely drowned'],
-        '',
-        0.0,
     )
 
 

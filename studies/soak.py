@@ -16,7 +16,7 @@ from typing import Any
 
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.live import LiveResult, run_live
-from continuum_loc.offline.trials import scene_map_file
+from continuum_loc.offline.scene_maps import scene_map_file
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.simulator.plant import load_plant
 from continuum_loc.simulator.trajectories import (

@@ -1,8 +1,4 @@
-"""
-Table IV of the localisation paper: the soft arm's rings one by one.
-
-Pooled over all conditions of Table III.
-"""
+"""Table IV of the localisation paper: the soft arm's rings, over all conditions of Table III."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, per_ring, trial_rows
 from continuum_loc.offline.study_report import write_study_report
 from continuum_loc.robot import load_robot
-from studies._soft_arm import FIDELITIES, soft_arm_trials
+from studies._soft_arm import conditions, soft_arm_trials
 from studies.support.campaign import Outcome, run_campaign
 from studies.support.split import HOLD_OUT
 from studies.table3 import judged, of_fidelity
@@ -35,7 +31,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     outcomes = run_campaign(soft_arm_trials(quick, seed), out, jobs)
     folder = out / 'table4'
     claims, tables = [], {}
-    for fidelity in FIDELITIES:
+    for fidelity in conditions():
         members = of_fidelity(outcomes, fidelity)
         tables[f'table4_{fidelity}'] = _rows(members)
         claims += _judge(judged(members), fidelity)
@@ -54,7 +50,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
         folder,
         'Table IV: the soft arm, ring by ring',
         claims,
-        {f'Errors, sensors as {name}': tables[f'table4_{name}'] for name in FIDELITIES},
+        {f'Errors, sensors as {name}': tables[f'table4_{name}'] for name in conditions()},
         outcomes,
         runs=out,
     )

@@ -207,9 +207,9 @@ class Client:
 
     def await_speakers(self) -> None:
         """
-        Wait until somebody publishes on every topic that this client hears, and knows it.
+        Wait until somebody publishes on every topic that this client hears, and knows of it.
 
-        What is said before that is lost.
+        A message that is sent before that is lost.
         """
         assert self.until(
             lambda: all(self.node.count_publishers(topic) > 0 for topic in self.heard)

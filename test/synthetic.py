@@ -54,11 +54,7 @@ def frame(robot: RobotDescription, name: str, stamp: int, rng: np.random.Generat
 
 
 class NoisyFilter:
-    """
-    Answers each cycle of ToF frames with the true poses plus errors.
-
-    Errors have exactly the covariance it states.
-    """
+    """Answers each cycle of ToF frames with true poses plus errors of the covariance it states."""
 
     def __init__(
         self, robot: RobotDescription | None = None, sigma: float = 0.002, seed: int = 0
@@ -81,6 +77,9 @@ class NoisyFilter:
 
     def flush(self):
         return None
+
+    def reset(self):
+        """Nothing of the past is kept."""
 
     def _estimate(self, stamp: int, lagged: bool = True) -> Estimate:
         true = truth_at(self.robot, stamp)

@@ -1,8 +1,4 @@
-"""
-Bags: everything of the contract is written and read back.
-
-Damaged and foreign bags are named.
-"""
+"""Bags: the whole contract is written and read back; damaged and foreign bags are named."""
 
 import re
 
@@ -186,7 +182,7 @@ def test_a_truncated_bag_is_named(bag, share):
     file = next(bag.glob('*.mcap'))
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(BagError, match='mcap recover'):
+    with pytest.raises(BagError, match='continuum-loc repair'):
         list(read_bag(bag))
 
 
@@ -212,6 +208,25 @@ def damaged(tmp_path_factory):
             writer.write('imu/data_raw', _imu(tick))
     file = next(folder.glob('*.mcap'))
     return file, file.read_bytes()
+
+
+def test_the_robot_without_a_namespace_is_chosen_by_a_slash_and_an_unknown_one_is_named(tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(tmp_path / 'b', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for root, robot in (('', 'plain'), ('/left/arm', 'left')):
+            connection = writer.add_connection(
+                f'{root}/imu/data_raw', 'sensor_msgs/msg/Imu', typestore=typestore()
+            )
+            message = TOPICS['imu/data_raw'].encode(_bag_messages(), _imu(1, robot))
+            writer.write(connection, 1, typestore().serialize_cdr(message, 'sensor_msgs/msg/Imu'))
+    for namespace, robot in (('/', 'plain'), ('left/arm', 'left'), ('/left/arm/', 'left')):
+        found = [item.sensor for _, item in read_bag(tmp_path / 'b', namespace=namespace)]
+        assert found == [robot]
+    with pytest.raises(BagError, match="holds several robots; .* '/', 'left/arm'"):
+        list(read_bag(tmp_path / 'b'))
+    with pytest.raises(BagError, match="no robot 'right' in it; .* '/', 'left/arm'"):
+        list(read_bag(tmp_path / 'b', namespace='right'))
 
 
 def test_a_bag_is_not_overwritten_and_foreign_topics_are_not_written(bag):

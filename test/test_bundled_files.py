@@ -10,7 +10,8 @@ from pathlib import Path
 
 from continuum_loc.estimator.settings import EstimatorSettings, PRESETS_FOLDER, settings_of
 from continuum_loc.measurements import TrackedPose
-from continuum_loc.offline.trials import make_filter, Trial, trial_settings
+from continuum_loc.offline.localise import make_filter, trial_settings
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from msg_tools.bag import BagWriter
 import numpy as np

@@ -1,19 +1,8 @@
-"""
-Test the chain against dense algebra.
-
-Solution, covariances, and marginalisation equal to the batch.
-"""
+"""The chain against dense algebra: solutions, covariances, marginals."""
 
 from continuum_loc.errors import SingularError
-from continuum_loc.estimator.chain import (
-    BLOCK,
-    Blocks,
-    Chain,
-    Cholesky,
-    half_square,
-    Message,
-    symmetric,
-)
+from continuum_loc.estimator.chain import BLOCK, Chain, Cholesky
+from continuum_loc.estimator.normal import Normal, symmetric
 import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
@@ -26,16 +15,16 @@ def random_chain(seed: int):
     intervals = []
     for _ in range(K - 1):
         A = rng.normal(size=(4 * D, 2 * D))
-        intervals.append(Blocks(np.triu(A.T @ A), rng.normal(size=2 * D)))
+        intervals.append(Normal(np.triu(A.T @ A), rng.normal(size=2 * D)))
     A = rng.normal(size=(2 * D, D))
-    return Message(np.triu(A.T @ A), rng.normal(size=D)), intervals
+    return Normal(np.triu(A.T @ A), rng.normal(size=D)), intervals
 
 
 def dense(start, intervals):
     size = D * (len(intervals) + 1)
     H, g = np.zeros((size, size)), np.zeros(size)
-    H[:D, :D] += symmetric(start.information)
-    g[:D] += start.gradient
+    H[:D, :D] += symmetric(start.H)
+    g[:D] += start.g
     for k, block in enumerate(intervals):
         at = slice(D * k, D * (k + 2))
         H[at, at] += symmetric(block.H)
@@ -95,14 +84,14 @@ def test_marginalising_equals_the_batch_solution():
 def test_half_a_square_is_that_of_the_whole_matrix():
     rng = np.random.default_rng(9)
     A, x = rng.normal(size=(2 * D, D)), rng.normal(size=D)
-    assert half_square(np.triu(A.T @ A), x) == pytest.approx(0.5 * x @ A.T @ A @ x)
+    assert Normal(np.triu(A.T @ A), x).half_square(x) == pytest.approx(0.5 * x @ A.T @ A @ x)
 
 
-def test_kept_messages_change_nothing():
+def test_kept_marginals_change_nothing():
     start, intervals = random_chain(3)
     chain = Chain(D, start)
     chain.solve(intervals, 0)
-    intervals[3] = Blocks(intervals[3].H * 1.5, intervals[3].g + 1.0)
+    intervals[3] = Normal(intervals[3].H * 1.5, intervals[3].g + 1.0)
     np.testing.assert_allclose(
         chain.solve(intervals, 3), Chain(D, start).solve(intervals, 0), atol=1e-10
     )
@@ -110,7 +99,7 @@ def test_kept_messages_change_nothing():
 
 def test_an_unobserved_direction_is_said():
     start, intervals = random_chain(1)
-    start.information[:] = 0.0
+    start.H[:] = 0.0
     intervals[0].H[0, :] = intervals[0].H[:, 0] = 0.0
     with pytest.raises(SingularError, match='column 0'):
         Chain(D, start).solve(intervals, 0)

@@ -1,22 +1,12 @@
-"""
-The command line: exit codes, errors in one line, help without heavy imports.
-
-Commands run in their own process.
-"""
+"""The command line, in a process of its own: exit codes, one-line errors, a light --help."""
 
 import json
 import subprocess
 import sys
 
 from continuum_loc.errors import StudyError
-from continuum_loc.offline.claims import (
-    at_least,
-    at_most,
-    between,
-    Claim,
-    plain,
-    write_study,
-)
+from continuum_loc.offline.as_json import plain
+from continuum_loc.offline.claims import at_least, at_most, between, Claim, write_study
 import pytest
 from studies import load_study
 

@@ -185,11 +185,7 @@ def test_a_tracked_pose_survives_and_its_topic_names_the_sensor(make, pose):
 @given(data=st.data())
 @settings(max_examples=5, deadline=None)
 def test_both_flavours_serialise_to_the_same_content(topic, data):
-    """
-    CDR of rclpy, read by rosbags, gives the same measurement.
-
-    So bags and graphs interoperate.
-    """
+    """CDR of rclpy, read by rosbags, gives the same measurement: a bag is as good as a graph."""
     from rclpy.serialization import serialize_message
 
     item = data.draw(MEASUREMENTS[topic])

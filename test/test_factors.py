@@ -1,17 +1,12 @@
-"""
-Every factor's gradient and Hessian against finite differences of its own residuals.
-
-Over random states.
-"""
+"""Every factor's gradient and Hessian against differences of its own residuals, at random."""
 
 from continuum_loc import lie
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import EstimatorSettings
-from continuum_loc.estimator.chain import Blocks, symmetric
-from continuum_loc.estimator.factors import FACTORS, TofFactor
+from continuum_loc.estimator.factors import FACTORS, Setup
+from continuum_loc.estimator.normal import Normal, symmetric
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import column_at_rest, Grid
-from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -90,14 +85,11 @@ def measurements(kind: str, description: RobotDescription):
     return [EncoderSample(EPOCH, ('tendon1', 'insertion'), np.array([0.0, 0.2]), np.zeros(2))]
 
 
-def make_factor(kind: str, description: RobotDescription, grid: Grid):
-    if kind == 'tof':
-        prior_map = room_map(0.05)
-        return TofFactor(
-            description, grid, SETTINGS, prior_map, VoxelIndex(prior_map.points, prior_map.normals)
-        )
-    factor = next(f for f in FACTORS if f.name == kind)
-    return factor(description, grid, SETTINGS)
+def make_factor(
+    kind: str, description: RobotDescription, grid: Grid, settings: EstimatorSettings = SETTINGS
+):
+    setup = Setup(description, grid, settings, room_map(0.05))
+    return next(factor for factor in FACTORS if factor.name == kind)(setup)
 
 
 @pytest.mark.parametrize(
@@ -112,8 +104,8 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
     times = np.linspace(0.2, 0.9, len(rows)) * DT
     batch = factor.stack(times, rows)
     a, b = columns(grid, seed)
-    blocks = Blocks.zeros(grid.dim)
-    factor.linearise(batch, a, b, blocks)
+    normal = Normal.zeros(2 * grid.dim)
+    factor.linearise(batch, a, b, normal)
     rng, bias = np.random.default_rng(seed), grid.bias_offset
     for _ in range(8):
         x, step = rng.normal(size=2 * grid.dim), 1e-6
@@ -125,16 +117,16 @@ def test_gradient_is_the_derivative_of_the_squared_error(kind, seed):
                 batch,
                 a.retract(sign * step * x_a),
                 b.retract(sign * step * x_b),
-                Blocks.zeros(grid.dim),
+                Normal.zeros(2 * grid.dim),
             ).squared
             for sign in (1.0, -1.0)
         ]
         slope = (ends[0] - ends[1]) / (4.0 * step)
-        scale = np.linalg.norm(blocks.g) * np.linalg.norm(x) / np.sqrt(len(x))
+        scale = np.linalg.norm(normal.g) * np.linalg.norm(x) / np.sqrt(len(x))
         if kind == 'tof':
             # Planarity weighs the information, not the reported squares; here it is one.
-            assert np.all(factor.surface[:, 6] == 1.0)
-        assert slope == pytest.approx(blocks.g @ x, abs=1e-5 * scale + 1e-6 * abs(slope))
+            assert np.all(factor.surface.planes.rows[:, 6] == 1.0)
+        assert slope == pytest.approx(normal.g @ x, abs=1e-5 * scale + 1e-6 * abs(slope))
 
 
 @pytest.mark.parametrize(
@@ -145,10 +137,10 @@ def test_hessian_is_an_upper_triangle_and_positive_semidefinite(kind):
     grid = Grid(description, 0.16)
     factor = make_factor(kind, description, grid)
     rows = [factor.row(m) for m in measurements(kind, description)]
-    blocks = Blocks.zeros(grid.dim)
-    factor.linearise(factor.stack(np.full(len(rows), 0.5 * DT), rows), *columns(grid, 3), blocks)
-    assert blocks.H.any() and not np.tril(blocks.H, -1).any()
-    assert np.linalg.eigvalsh(symmetric(blocks.H))[0] > -1e-9 * np.abs(blocks.H).max()
+    normal = Normal.zeros(2 * grid.dim)
+    factor.linearise(factor.stack(np.full(len(rows), 0.5 * DT), rows), *columns(grid, 3), normal)
+    assert normal.H.any() and not np.tril(normal.H, -1).any()
+    assert np.linalg.eigvalsh(symmetric(normal.H))[0] > -1e-9 * np.abs(normal.H).max()
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -158,19 +150,19 @@ def test_prior_gradient(seed):
     priors = Priors(description, grid, SETTINGS)
     a, b = columns(grid, seed)
 
-    def blocks_at(x):
-        out = Blocks.zeros(grid.dim)
+    def cost_at(x, normal):
         x_a, x_b = np.split(x, 2)
-        priors.add(out, a.retract(x_a), b.retract(x_b))
-        return out
+        return priors.add(normal, a.retract(x_a), b.retract(x_b))[0]
 
-    centre, rng = blocks_at(np.zeros(2 * grid.dim)), np.random.default_rng(seed)
+    centre, rng = Normal.zeros(2 * grid.dim), np.random.default_rng(seed)
+    cost_at(np.zeros(2 * grid.dim), centre)
     bias = grid.bias_offset
     for _ in range(8):
         x, step = rng.normal(size=2 * grid.dim), 1e-6
         for one in np.split(x, 2):
             one[bias:] = 0.0  # the bias walk reports no cost
-        slope = (blocks_at(step * x).cost - blocks_at(-step * x).cost) / (2.0 * step)
+        ends = [cost_at(sign * step * x, Normal.zeros(2 * grid.dim)) for sign in (1.0, -1.0)]
+        slope = (ends[0] - ends[1]) / (2.0 * step)
         assert slope == pytest.approx(centre.g @ x, rel=1e-6)
     assert centre.H.any() and not np.tril(centre.H, -1).any()
 
@@ -180,7 +172,7 @@ def test_strain_matches_the_papers_map():
     description = robot()
     factor = make_factor('strain', description, Grid(description, 0.16))
     theta, kappa = np.array([0.3, -2.0]), np.array([0.8, 1.5])
-    _, bending, _ = factor.row(StrainSample(EPOCH, np.array([0.1, 0.5]), theta, kappa))
+    bending = factor.row(StrainSample(EPOCH, np.array([0.1, 0.5]), theta, kappa)).bending
     for i in range(2):
         T = np.eye(4)
         T[:3, :3] = lie.so3_exp(np.array([theta[i], 0.0, 0.0]))
@@ -190,11 +182,7 @@ def test_strain_matches_the_papers_map():
 
 
 def test_strain_noise_across_the_bending_plane():
-    """
-    Across the plane the noise is kappa sigma_theta where that is larger.
-
-    Along it, it is sigma_kappa.
-    """
+    """Along the plane the noise is sigma_kappa, across it kappa sigma_theta where larger."""
     description = robot()
     factor = make_factor('strain', description, Grid(description, 0.16))
     kappa = 4.0
@@ -228,10 +216,10 @@ def test_a_jerked_nodes_step_counts_less_to_a_limit_and_others_as_before(sigmas,
     jerked.velocity[2, 0] = sigmas * np.sqrt(18.0) * sigma
 
     def velocity_information(b):
-        blocks = Blocks.zeros(grid.dim)
-        priors.add(blocks, a, b)
+        normal = Normal.zeros(2 * grid.dim)
+        priors.add(normal, a, b)
         at = [18 * n + 12 for n in range(grid.nodes)]
-        return blocks.H[at, at]  # the older column's, which the step alone informs
+        return normal.H[at, at]  # the older column's, which the step alone informs
 
     share = velocity_information(jerked) / velocity_information(still)
     others = np.ones(grid.nodes)
@@ -244,18 +232,18 @@ def gyro_at_rest(rates: np.ndarray, cauchy: float):
     description = robot()
     grid = Grid(description, 0.16)
     settings = parse_settings(EstimatorSettings, {'gyro': {'cauchy': cauchy}})
-    factor = next(f for f in FACTORS if f.name == 'gyro')(description, grid, settings)
+    factor = make_factor('gyro', description, grid, settings)
     R = description.imu[0].mount.T_ring_sensor[:3, :3]
     rows = [
         factor.row(ImuSample(EPOCH, description.imu[0].name, R.T @ rate, np.zeros(3)))
         for rate in rates
     ]
     a = column_at_rest(grid, np.eye(4), np.tile([1.0, 0, 0, 0, 0, 0], (grid.nodes, 1)), 0.0)
-    blocks = Blocks.zeros(grid.dim)
+    normal = Normal.zeros(2 * grid.dim)
     batch = factor.stack(np.linspace(0.1, 0.9, len(rates)) * DT, rows)
-    report = factor.linearise(batch, a, a.predict(DT), blocks)
+    report = factor.linearise(batch, a, a.predict(DT), normal)
     at = slice(grid.bias_offset, grid.bias_offset + 3)
-    return report.cost, blocks.g[at], symmetric(blocks.H)[at, at]
+    return report.cost, normal.g[at], symmetric(normal.H)[at, at]
 
 
 def test_the_loss_of_a_gyro_is_the_integral_of_its_slope():

@@ -1,8 +1,4 @@
-"""
-The filter's studies judge as they say, and faults do what they are called.
-
-Times off, recovery, culprits, honesty.
-"""
+"""The filter's studies judge as they say, and faults do what they are called."""
 
 from dataclasses import replace
 import json
@@ -201,7 +197,7 @@ def recorded(monkeypatch):
 
     for name, stand_in in (
         ('record_bags', lambda *_: {}),
-        ('scene_map_file', Path),
+        ('trial_map_file', lambda trial: Path('map.npz')),
         ('load_map', lambda file: None),
         ('made_by', lambda bag: ''),
         ('make_filter', filter_),

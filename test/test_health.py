@@ -2,10 +2,10 @@
 
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
-from continuum_loc.estimator.chain import Blocks
 from continuum_loc.estimator.clocks import ClockEvidence
 from continuum_loc.estimator.factors.gyro import judge
-from continuum_loc.estimator.output import rattle_covariance
+from continuum_loc.estimator.interpolation import rattle_covariance
+from continuum_loc.estimator.normal import Normal
 from continuum_loc.estimator.state import Grid
 from continuum_loc.measurements import TruthSample
 from continuum_loc.offline.trials import _base_drawn
@@ -36,17 +36,15 @@ def test_clock_scores_are_derivatives_by_the_stamps(kind, seed):
     times = np.linspace(0.2, 0.8, len(rows)) * DT
     a, b = columns(grid, seed)
     batch = factor.stack(times, rows)
-    factor.linearise(batch, a, b, Blocks.zeros(grid.dim))
+    factor.linearise(batch, a, b, Normal.zeros(2 * grid.dim))
     scores = factor.clock_scores(batch, a, b)
-    which = batch[1]
-    for number, name in enumerate(scores.sensors):
-        moved = which == list(factor.weights).index(name)
-        cost = [
-            factor.linearise(
-                (batch[0] + sign * STEP * moved, *batch[1:]), a, b, Blocks.zeros(grid.dim)
-            ).squared
+    which = batch.sensors if kind == 'tof' else batch.imus
+    for number in range(len(factor.sensors)):
+        late = [
+            batch._replace(times=batch.times + sign * STEP * (which == number))
             for sign in (1.0, -1.0)
         ]
+        cost = [factor.linearise(one, a, b, Normal.zeros(2 * grid.dim)).squared for one in late]
         slope = (cost[0] - cost[1]) / (4.0 * STEP)
         assert slope == pytest.approx(scores.gradient[number], rel=2e-3, abs=1e-6)
         assert scores.information[number] > 0.0
@@ -110,12 +108,12 @@ def test_rattle_is_the_angle_that_residual_rates_integrate_to():
     description = robot()
     factor = make_factor('gyro', description, Grid(description, 0.16))
     times = np.arange(0.0, 1.0, 0.005)
-    rng, sigma = np.random.default_rng(0), factor._weight**-0.5
+    rng, sigma = np.random.default_rng(0), factor.information**-0.5
     omega, amplitude = 2.0 * np.pi * 9.0, 60.0 * sigma
 
     def rattle_of(residuals):
         fits, rattle = np.zeros((1, 2)), np.zeros((1, 3))
-        judge(times, np.zeros(len(times), int), residuals, factor._weight, fits, rattle)
+        judge(times, np.zeros(len(times), int), residuals, factor.information, fits, rattle)
         return rattle[0]
 
     noise = sigma * rng.normal(size=(len(times), 3))

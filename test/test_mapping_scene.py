@@ -230,7 +230,7 @@ def test_rays_cross_the_mapped_surface_where_they_cross_the_mesh():
     closest = np.einsum('ij,ij->i', origins, directions)
     miss = np.linalg.norm(origins - closest[:, None] * directions, axis=1)
     depth = -closest - np.sqrt(np.maximum(1.0 - miss**2, 0.0))
-    row, found = first_crossings(prior, prior.index(), origins, directions, np.full(2000, 5.0))
+    row, found = first_crossings(prior, prior.index, origins, directions, np.full(2000, 5.0))
     inside = miss < 0.9
     assert np.mean(row[inside] >= 0) > 0.99
     hit = inside & (row >= 0)
@@ -297,7 +297,7 @@ def test_points_on_the_map_pass_the_chi2_test_at_its_level():
     trajectory, mesh = swaying(), room()
     prior = sample_mesh(mesh.vertices, mesh.faces, spacing=0.01)
     cloud = reconstruct(ROBOT, measured(trajectory, mesh, seed=5), trajectory)
-    distance2, _ = mahalanobis2(cloud, prior, 0.3, prior.index())
+    distance2, _ = mahalanobis2(cloud, prior, 0.3, prior.index)
     assert np.mean(distance2 > stats.chi2(3).ppf(0.99)) < 0.02
     assert np.mean(distance2) > 0.5  # nor is the covariance so wide that nothing could ever be new
 
@@ -399,7 +399,7 @@ def test_what_an_edge_of_the_map_explains_is_no_anomaly(kind, x, length, explain
         kind, np.zeros((count, 3)), np.zeros(3), np.zeros(3), count, count, 1.0, np.arange(count)
     )
     settings = AnomalySettings()
-    share = unexplained_share(cluster, beams, prior, settings, prior.index())
+    share = unexplained_share(cluster, beams, prior, settings, prior.index)
     # Discs leave holes of 3 %, and one in any of a beam's seven lines explains it.
     assert share < 0.1 if explained else share > 0.97**7 - 0.15
 

@@ -174,11 +174,7 @@ def test_equal_tensions_shorten_an_extensible_rod_by_their_sum_over_EA():
 
 
 def test_tendon_friction_leaves_a_hysteresis():
-    """
-    From below and from above, the same tension F bends as F - 2 f and F + 2 f.
-
-    Two tendons move, both rub.
-    """
+    """The same tension F bends as F - 2 f from below and as F + 2 f from above: both rub."""
     friction, pull = 0.5, 3.0
     plant, model = tendon_rod(friction=friction)
     data = mujoco.MjData(model)

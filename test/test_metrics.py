@@ -1,8 +1,4 @@
-"""
-Errors against evo's, consistency against the distributions it is defined by.
-
-And tracks against their files.
-"""
+"""Errors against evo's, consistency against its distributions, trajectories against files."""
 
 from continuum_loc import lie
 from continuum_loc.errors import TrajectoryError
@@ -19,11 +15,7 @@ START = 1_700_000_000 * NANOSECONDS + 123_456_789
 
 
 def smooth_truth(count: int = 200, period: float = 0.01) -> Trajectory:
-    """
-    Move a body whose rings turn and travel at constant body velocities.
-
-    So geodesics are exact.
-    """
+    """Move a body whose rings have constant body velocities, so that geodesics are exact."""
     twists = np.array(
         [[0, 0, 0, 0, 0, 0], [0.1, 0.02, 0, 0, 0.3, 0.1], [0.2, -0.1, 0.05, 0.2, 0.5, -0.7]], float
     )

@@ -152,11 +152,7 @@ def test_services_save_what_was_estimated(fresh, box):
 
 
 def test_initialpose_moves_the_base(fresh, box):
-    """
-    The estimate starts at the base that it is given, 3 cm to the side.
-
-    Known to the robot description's 0.5 mm.
-    """
+    """The estimate starts at the base that it is given, 3 cm to the side, known to 0.5 mm."""
     client, node, _ = fresh
     publisher = client.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
     assert client.until(lambda: publisher.get_subscription_count() > 0)

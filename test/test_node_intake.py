@@ -10,7 +10,7 @@ import threading
 import time
 
 from continuum_loc.estimator import settings_of, SlidingWindowFilter
-from continuum_loc.intake import Early, Inbox, Intake, SACRIFICE, StampGate
+from continuum_loc.intake import Intake, StampGate
 from continuum_loc.measurements import (
     EncoderSample,
     ImuSample,
@@ -19,6 +19,7 @@ from continuum_loc.measurements import (
     TofFrame,
     TrackedPose,
 )
+from continuum_loc.nodes.support.inbox import Early, Inbox, SACRIFICE
 from continuum_loc.nodes.support.pacing import Paced
 from continuum_loc.nodes.support.settings import IntakeSettings
 from continuum_loc.nodes.support.warm_up import rest_samples
@@ -199,8 +200,13 @@ def test_zero_future_and_doubled_stamps_are_told_apart():
     assert gate.judge(START - SECOND // 10, 'b', now) is None
 
 
-@pytest.mark.parametrize(('leap', 'restarts'), [(-100 * SECOND, 1), (+100 * SECOND, 0)])
+@pytest.mark.parametrize(
+    ('leap', 'restarts'),
+    [(-100 * SECOND, 1), (+2 * SECOND, 0), (+100 * SECOND, 1), (+(10**9) * SECOND, 1)],
+    ids=['backward', 'gap', 'pause', 'another clock'],
+)
 def test_a_leap_is_believed_only_when_several_agree(leap, restarts):
+    """A motion prior bridges two seconds; over more the data starts anew, however far it is."""
     gate = StampGate(IntakeSettings(jump_confirmations=10))
     assert gate.judge(START, 'a', 0) is None
     verdicts = [gate.judge(START + leap + k * SECOND // 100, 'a', 0) for k in range(12)]

@@ -9,7 +9,8 @@ from continuum_loc.estimator.settings import settings_of
 from continuum_loc.measurements import TruthSample
 from continuum_loc.offline import bags
 from continuum_loc.offline.bags import bag_trials, evaluate_bags
-from continuum_loc.offline.trials import scene_map_file, simulate, Trial, write_bag
+from continuum_loc.offline.scene_maps import scene_map_file
+from continuum_loc.offline.trials import simulate, Trial, write_bag
 from continuum_loc.robot import load_robot
 import pytest
 

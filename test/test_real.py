@@ -1,8 +1,4 @@
-"""
-Recorded trials: their import, and the filter on them.
-
-Skipped where CONTINUUM_LOC_DATA is unset.
-"""
+"""Recorded trials: their import, and the filter on them (where CONTINUUM_LOC_DATA is set)."""
 
 import os
 
@@ -67,11 +63,7 @@ def trial(tmp_path):
 
 
 def test_the_tangent_becomes_body_x_and_motion_keeps_its_meaning(trial):
-    """
-    A rate in the imported body frame is what the imported poses turn by.
-
-    dT/dt = T hat(omega), about the tangent.
-    """
+    """The imported rates turn the imported poses: dT/dt = T hat(omega), about the tangent."""
     recording = read_recording(trial, ROBOT)
     tip = [
         sample
@@ -175,11 +167,7 @@ def test_hermite_curves_give_the_published_figures():
 
 @needs_data
 def test_the_smoothed_filter_beats_hermite_and_the_published_filter_inside_the_body(tmp_path):
-    """
-    At the three discs without a tracker, through the impulses, 0.1 s late.
-
-    Gyros and bending must help there.
-    """
+    """Gyros and bending help the three discs without a tracker, through impulses, 0.1 s late."""
     from studies.real import run
 
     inner = [

@@ -1,9 +1,6 @@
-"""
-Scenes: closed, of the stated size, with free way for the robot.
+"""Scenes: closed, of the stated size, with free way and exact truth of their anomalies."""
 
-And with exact truth of their anomalies.
-"""
-
+from continuum_loc.caches import cache_folder
 from continuum_loc.errors import SceneError
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator import convex, cutting, mesh_import, scene_cache
@@ -20,6 +17,7 @@ from studies._pieces import standing_out
 import trimesh
 
 VARIANTS = ('S2', 'S5', 'S9')  # one of each kind: added objects, missing features, both
+GENERATOR = 'continuum_loc.simulator.box'
 CUBE = trimesh.creation.box((1.0, 1.0, 1.0))
 
 
@@ -250,29 +248,31 @@ def test_cache_gives_back_the_scene_and_builds_it_once(tmp_path, monkeypatch):
         built.append(1)
         return small_scene()
 
-    first, second = (scene_cache.cached_scene('small', [source], build) for _ in range(2))
+    first, second = (
+        scene_cache.cached_scene('small', GENERATOR, build, [source]) for _ in range(2)
+    )
     assert len(built) == 1
     np.testing.assert_array_equal(first.vertices, second.vertices)
     np.testing.assert_array_equal(first.hulls[1], second.hulls[1])
     assert len(second.hulls) == 2 and second.objects == ('cube',)
     assert second.anomalies[1].kind == 'added' and second.anomalies[1].faces.shape == (12, 3)
     source.write_text('v2')
-    scene_cache.cached_scene('small', [source], build)
+    scene_cache.cached_scene('small', GENERATOR, build, [source])
     assert len(built) == 2  # a changed generator never meets an old entry
 
 
 def test_cache_entry_cut_short_is_built_again(tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    scene_cache.cached_scene('small', [], small_scene)
-    entry = next(scene_cache.cache_folder().glob('*.npz'))
+    scene_cache.cached_scene('small', GENERATOR, small_scene)
+    entry = next(cache_folder(scene_cache.KIND).glob('*.npz'))
     entry.write_bytes(entry.read_bytes()[:200])
-    assert scene_cache.cached_scene('small', [], small_scene).faces.shape == (12, 3)
+    assert scene_cache.cached_scene('small', GENERATOR, small_scene).faces.shape == (12, 3)
 
 
 def test_no_cache_folder_costs_time_only(tmp_path, monkeypatch):
     (tmp_path / 'file').write_text('in the way')
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'file'))
-    assert scene_cache.cached_scene('small', [], small_scene).name == 'small'
+    assert scene_cache.cached_scene('small', GENERATOR, small_scene).name == 'small'
 
 
 # A user's own mesh.

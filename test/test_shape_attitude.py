@@ -6,19 +6,13 @@ Known tilts, gravity's silence on yaw, the gate, and what the printed form gets 
 
 from continuum_loc import lie
 from continuum_loc.measurements import nanoseconds
-from continuum_loc.shape.attitude import (
-    AttitudeSettings,
-    euler_rates,
-    EulerFilter,
-    GRAVITY,
-    GravityFilter,
-    level,
-)
+from continuum_loc.shape.attitude import AttitudeSettings, GRAVITY, GravityFilter, level
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from studies.support.euler_filter import euler_rates, EulerFilter
 
 UP = np.array([0.0, 0.0, 1.0])
 DT = nanoseconds(0.01)

@@ -12,13 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from studies.support.shape_paper import printed_quadratic_bezier
+from studies.support.shape_curves import (
+    at_fractions,
+    fit_projected,
+    printed_quadratic_bezier,
+    project,
+)
 
 ROBOT = load_robot('hall_arm')
 ARM = Arm(ROBOT, PERFECT)
 S = np.array([0.0, 0.025, 0.05, 0.075])
 FRACTIONS = np.linspace(0.0, 1.0, 301)
-METHODS = list(curves.SPATIAL)
+METHODS = list(curves.CURVES)
+FORMS = [curves.fit_curve, fit_projected]
 azimuths = st.floats(-3.1, 3.1)
 
 
@@ -29,16 +35,16 @@ def sampled(strain):
 
 
 def errors(points, truth):
-    return np.linalg.norm(curves.at_fractions(points, FRACTIONS) - truth, axis=1)
+    return np.linalg.norm(at_fractions(points, FRACTIONS) - truth, axis=1)
 
 
-@given(st.floats(1.0, 30.0), azimuths, st.booleans())
+@given(st.floats(1.0, 30.0), azimuths, st.sampled_from(FORMS))
 @settings(max_examples=40, deadline=None)
-def test_arc_is_exact_on_arcs(curvature, azimuth, projected):
+def test_arc_is_exact_on_arcs(curvature, azimuth, fit):
     points, tangents, truth = sampled(bent(ROBOT, curvature, azimuth))
-    curve = curves.fit_curve(points, tangents, 'kasa_arc', projected, samples=2001)
+    curve = fit(points, tangents, 'kasa_arc', samples=2001)
     assert errors(curve, truth).max() < 2e-7
-    circle = curves.kasa_circle(curves.project(points))
+    circle = curves.kasa_circle(project(points))
     assert circle[2] == pytest.approx(1.0 / curvature, rel=1e-9)
 
 
@@ -53,22 +59,20 @@ def test_quadratic_bezier_converges_on_an_arc_with_the_fourth_power_of_the_angle
     worst = []
     for curvature in (5.0, 10.0):
         points, tangents, truth = sampled(bent(ROBOT, curvature))
-        curve = curves.fit_curve(points, tangents, 'quadratic_bezier', True, samples=4001)
+        curve = fit_projected(points, tangents, 'quadratic_bezier', samples=4001)
         # The nearest point, so that only the shape counts.
         gap = np.linalg.norm(curve[:, None] - truth[None], axis=2).min(axis=0)
-        radius = np.hypot(
-            *(curves.project(curve) - curves.kasa_circle(curves.project(truth))[:2]).T
-        )
+        radius = np.hypot(*(project(curve) - curves.kasa_circle(project(truth))[:2]).T)
         worst.append(np.abs(radius * curvature - 1.0).max())
         assert gap.max() < 1e-4
     assert worst[1] / worst[0] == pytest.approx(16.0, rel=0.05)
 
 
 @pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('projected', [True, False])
-def test_straight_is_a_line(method, projected):
+@pytest.mark.parametrize('fit', FORMS)
+def test_straight_is_a_line(method, fit):
     points, tangents, truth = sampled(bent(ROBOT, 0.0))
-    curve = curves.fit_curve(points, tangents, method, projected)
+    curve = fit(points, tangents, method)
     assert np.isfinite(curve).all() and errors(curve, truth).max() < 1e-12
 
 
@@ -103,7 +107,7 @@ def test_nearly_straight_stays_nearly_straight(noise, method):
 def test_the_projected_forms_do_not_fail_on_noise(noise, method):
     """It can throw the paper's forms off (see the next test), but they give a curve."""
     points, tangents, _ = nearly_straight(noise)
-    assert np.isfinite(curves.fit_curve(points, tangents, method, projected=True)).all()
+    assert np.isfinite(fit_projected(points, tangents, method)).all()
 
 
 def test_the_projected_arc_takes_a_zigzag_for_a_bend():
@@ -116,10 +120,7 @@ def test_the_projected_arc_takes_a_zigzag_for_a_bend():
     points, tangents, truth = nearly_straight(
         [0, 0, 7.0e-5, 0, 0, 4.2e-5, 0, 9.5e-5, 5.5e-5, *[0.0] * 6]
     )
-    projected, spatial = (
-        errors(curves.fit_curve(points, tangents, 'kasa_arc', flat), truth).max()
-        for flat in (True, False)
-    )
+    spatial, projected = (errors(fit(points, tangents, 'kasa_arc'), truth).max() for fit in FORMS)
     assert projected > 8e-4
     assert spatial < 2e-4
 
@@ -131,7 +132,7 @@ def test_the_projected_arc_takes_a_zigzag_for_a_bend():
 def test_spatial_forms_hold_where_the_projection_folds(method, strain, name):
     points, tangents, truth = sampled(strain)
     spatial = errors(curves.fit_curve(points, tangents, method), truth).mean()
-    projected = errors(curves.fit_curve(points, tangents, method, projected=True), truth).mean()
+    projected = errors(fit_projected(points, tangents, method), truth).mean()
     assert spatial < 4e-4
     assert spatial < 0.5 * projected or name == 'S' and method == 'cubic_bezier'
 
@@ -173,7 +174,7 @@ def test_printed_kappa_points_the_wrong_way():
     """
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 3.0, 0.0]])
     tangents = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    mended = curves.fit_curve(points, tangents, 'quadratic_bezier', projected=True, samples=5)
+    mended = fit_projected(points, tangents, 'quadratic_bezier', samples=5)
     # (p0 + 2 beta + p1) / 4 with beta = (1, 0).
     np.testing.assert_allclose(mended[1], [0.75, 0.25, 0.0])
     printed = printed_quadratic_bezier(points, tangents, 5)

@@ -9,7 +9,7 @@ from continuum_loc.measurements import FieldSample, ImuSample, NANOSECONDS, seco
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import dump_settings, parse_settings
 from continuum_loc.shape import curves, load_shape_settings, ShapeEstimator, ShapeSettings
-from continuum_loc.shape.backbone import _forward, BackboneSolver, PIECES
+from continuum_loc.shape.backbone import _forward, BackboneSolver
 from continuum_loc.shape.calibration import (
     calibrate,
     Calibration,
@@ -30,6 +30,7 @@ from continuum_loc.simulator.hall_arm import (
 )
 import numpy as np
 import pytest
+from studies.support.shape_curves import at_fractions
 from studies.support.shape_paper import Background, MENDS, paper_pipeline
 
 ROBOT = load_robot('hall_arm')
@@ -171,15 +172,6 @@ def test_joint_fit_recovers_arcs_from_fields_and_attitudes_alike():
     rng = np.random.default_rng(2)
     solver = BackboneSolver(ROBOT, S)
     strain = rng.normal(size=(3, 3)) * [0.02, 12, 12]
-    exact = solver.solve(
-        np.zeros((3, 3)),
-        np.full((3, 3), np.inf),
-        np.zeros(3),
-        np.stack([np.eye(3)] * 3),
-        np.zeros((3, 3, 3)),
-        np.repeat(strain, PIECES, axis=0),
-    )
-    np.testing.assert_allclose(exact.strain, 0.0, atol=1e-9)  # nothing measured: the prior
     T = np.eye(4)
     poses = []
     for row in strain:
@@ -194,6 +186,22 @@ def test_joint_fit_recovers_arcs_from_fields_and_attitudes_alike():
     fit = solver.solve(field, np.full((3, 3), 1e-7), earth, poses[:, :3, :3], information)
     assert fit.converged
     np.testing.assert_allclose(fit.T_base_module[:, :3, 3], poses[:, :3, 3], atol=2e-5)
+
+
+def test_joint_fit_to_nothing_is_the_prior():
+    """The robot file's curvature of 15 1/m (1 sigma) from its rest, which is straight."""
+    fit = BackboneSolver(ROBOT, S[:1], step_sigma=0.01).solve(
+        np.zeros((1, 3)),
+        np.full((1, 3), np.inf),
+        np.zeros(3),
+        np.eye(3)[None],
+        np.zeros((1, 3, 3)),
+    )
+    np.testing.assert_allclose(fit.strain, 0.0, atol=1e-9)
+    np.testing.assert_allclose(fit.T_base_module[0, :3, 3], [0.025, 0.0, 0.0], atol=1e-12)
+    # One stiff arc of 25 mm turns its end by 25 mm * 15 1/m.
+    turn = np.sqrt(np.diag(fit.covariance[0])[4:])
+    np.testing.assert_allclose(turn, 0.025 * 15.0, rtol=1e-5)
 
 
 def test_joint_fit_bridges_a_module_that_says_nothing(arm, calibration, recording):
@@ -218,7 +226,7 @@ def test_joint_fit_bridges_a_module_that_says_nothing(arm, calibration, recordin
 
 def test_chain_of_arcs_differentiates_on_the_right():
     rng = np.random.default_rng(3)
-    lengths = BackboneSolver(ROBOT, S).lengths
+    lengths = BackboneSolver(ROBOT, S).rod.lengths
     strain = rng.normal(size=(len(lengths), 3)) * [0.5, 15, 15]
     T, chain = _forward(strain, lengths)
 
@@ -280,7 +288,7 @@ def test_calibrated_arm_finds_the_grooves(arm, calibration, groove):
     curve = (last.curve[:61] - ROBOT.base.T_map_base[:3, 3]) @ ROBOT.base.T_map_base[:3, :3]
     fractions = np.linspace(0.0, 1.0, 101)
     error = np.linalg.norm(
-        curves.at_fractions(curve, fractions) - arm.backbone(strain, 0.075 * fractions), axis=1
+        at_fractions(curve, fractions) - arm.backbone(strain, 0.075 * fractions), axis=1
     )
     assert error.mean() < 5e-5 and error.max() < 1.5e-4
 
@@ -380,21 +388,6 @@ def test_module_that_comes_back_is_taken_up_again(arm, calibration, fault):
     assert np.linalg.norm(found[-1].T_map_module[1, :3, 3] - truth[1, :3, 3]) < 4e-4
     assert lie.rotation_error_deg(found[-1].T_map_module[1, :3, :3], truth[1, :3, :3]) < 2.0
     assert found[-1].yaw_sigma[1] > np.radians(2.0)
-
-
-def test_euler_form_is_an_option_that_finds_a_gentle_bend(arm, calibration):
-    strain = bent(ROBOT, 12.5, np.radians(-90.0))
-    settings = ShapeSettings(attitude_filter='euler')
-    last = estimates(
-        ShapeEstimator(ROBOT, settings, calibration), arm.record(groove_motion(arm, strain))
-    )[-1]
-    assert np.isinf(last.yaw_sigma).all(), 'it states no uncertainty of its yaw'
-    assert (
-        np.linalg.norm(
-            last.T_map_module[:, :3, 3] - true_poses(arm, strain)[:, :3, 3], axis=1
-        ).max()
-        < 2e-3
-    )
 
 
 def test_reset_tares_again(calibration, recording):

@@ -1,8 +1,4 @@
-"""
-Campaigns lose no trial and repeat none; the split is kept.
-
-Benchmarks and tuning judge as they say.
-"""
+"""Campaigns lose no trial and repeat none; split, benchmarks and tuning judge as they say."""
 
 from dataclasses import replace
 import json
@@ -32,6 +28,7 @@ from studies._soft_arm import soft_arm_trials
 from studies.support import campaign
 from studies.support.campaign import Outcome, run_campaign
 from studies.support.split import HOLD_OUT, is_hold_out, require_unseen
+from studies.support.worlds import in_worlds, told
 
 
 def outcome(trial, translation=0.001, rotation=0.1, silent=0.0):
@@ -102,11 +99,46 @@ def test_results_of_other_code_are_not_taken(done, tmp_path, monkeypatch, change
         'bag': campaign.bag_of(tmp_path, trials[0]) / 'metadata.yaml',
     }
     before = {name: path.stat().st_mtime_ns for name, path in files.items()}
-    monkeypatch.setattr(campaign, changed, lambda: 'of other code')
+    monkeypatch.setattr(campaign, changed, lambda *entries: 'of other code')
     run_campaign(trials[:1], tmp_path)
     assert {name for name, path in files.items() if path.stat().st_mtime_ns != before[name]} == (
         renewed
     )
+
+
+def test_a_robot_that_was_edited_is_recorded_anew(tmp_path):
+    from continuum_loc.robot import ROBOTS_FOLDER
+
+    robot = tmp_path / 'mine.yaml'
+    text = (ROBOTS_FOLDER / 'soft_arm.yaml').read_text()
+    robot.write_text(text)
+    trial = Trial(str(robot), 'R0', 'b1', 'R0', plant='soft_arm', seed=3, duration=0.2)
+    assert campaign.record_bags([trial], tmp_path) == {}
+    bag = campaign.bag_of(tmp_path, trial)
+    assert campaign.recorded(bag, trial)
+    robot.write_text(text + '\n# measured again\n')
+    assert not campaign.recorded(bag, trial)
+
+
+def test_another_recording_in_the_same_place_is_estimated_anew(done, tmp_path):
+    out, trials, _ = done
+    bag = campaign.bag_of(tmp_path, trials[0])
+    shutil.copytree(campaign.bag_of(out, trials[0]), bag)
+    (bag / campaign.MADE_BY).unlink()
+    before = campaign.made_by(bag)
+    (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text() + '\n')
+    assert campaign.made_by(bag) != before
+
+
+def test_different_trials_of_one_name_are_refused(tmp_path):
+    for folder in ('a', 'b'):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / 'mine.yaml').write_text(folder)
+    one, other = (Trial(str(tmp_path / folder / 'mine.yaml')) for folder in ('a', 'b'))
+    with pytest.raises(StudyError, match='two different trials are called'):
+        run_campaign([one, other], tmp_path)
+    with pytest.raises(StudyError, match='recorded as'):
+        campaign.record_bags([one, other], tmp_path)
 
 
 def test_a_recording_that_somebody_put_there_is_taken(done, tmp_path, monkeypatch):
@@ -172,6 +204,19 @@ def test_the_soft_arm_campaign_is_the_papers():
     assert len({trial.recording for trial in trials}) == 23
     assert len({(trial.map_scene, trial.scene) for trial in trials}) == 13
     assert len(table2.trials(False, 0)) == 30
+
+
+def test_every_condition_has_the_same_trials_and_worlds_are_told_apart():
+    """The disturbed world has its own sensors; a claim of it says so."""
+    trials = soft_arm_trials(False, 0)
+    assert len(trials) == 3 * 61 and len({trial.name for trial in trials}) == 3 * 61
+    disturbed = [trial for trial in trials if trial.world == 'disturbed']
+    assert len(disturbed) == 61 and {trial.fidelity for trial in disturbed} == {'vl53l5cx'}
+    both = in_worlds(table2.trials(True, 0))
+    assert [trial.world for trial in both] == ['ideal'] * 2 + ['disturbed'] * 2
+    claims = table2.judge([outcome(trial) for trial in both[2:]])
+    assert {claim.name for claim in told(claims, 'ideal')} == {claim.name for claim in claims}
+    assert all(claim.name.startswith('disturbed: ') for claim in told(claims, 'disturbed'))
 
 
 def test_no_claim_rests_on_the_hold_out():

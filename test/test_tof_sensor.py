@@ -25,7 +25,9 @@ import trimesh
 FALSE_ALARM = 1e-4
 MIDDLE = [27, 28, 35, 36]
 MODEL = TofModel()
-IDEAL = Vl53l5cxSettings(crosstalk=0.0, dropout=0.0, inconsistent=0.0, fluctuation=0.0)
+CHANCE = ('fluctuation', 'crosstalk', 'tail', 'dropout', 'faint', 'stray', 'inconsistent', 'blind')
+UNIT = ('range_offset', 'range_scale', 'warm_up', 'pattern')
+IDEAL = Vl53l5cxSettings(ambient=0.0, new_target=1.0, **dict.fromkeys(CHANCE + UNIT, 0.0))
 
 
 def scene_of_mesh(mesh: trimesh.Trimesh, reflectance: float = 0.5) -> Scene:
@@ -324,8 +326,8 @@ def test_perpendicular_distance_comes_in_millimetres_with_the_stated_noise():
     depth = np.concatenate([depths_of(frame) for frame in frames])
     np.testing.assert_allclose(depth * 1e3, np.round(depth * 1e3), atol=1e-9)
     signal = 0.88 / 0.8**2 * np.mean(receiver.directions[:, 0] ** 2)
-    faintness = 1.0 + IDEAL.threshold / signal
-    light = np.hypot(MODEL.sigma(np.array(0.8)), IDEAL.noise_floor) * np.sqrt(faintness)
+    faintness = IDEAL.threshold / signal
+    light = 0.0032 * np.sqrt(1.0 + IDEAL.faint_noise * faintness)  # the table's row at 0.8 m
     deviation = np.hypot(light, 1e-3 / np.sqrt(12))
     # 12,800 readings: 0.6 % at one sigma.
     assert np.std(depth) == pytest.approx(deviation, rel=0.03)
@@ -345,9 +347,11 @@ def test_reach_is_the_datasheets(reflectance, reach):
 
 
 def test_a_grazing_wall_is_lost_before_a_facing_one():
-    """Reflectance 0.2 at 1 m: seen straight on, too faint at 80 degrees of incidence."""
+    """Reflectance 0.12 at 1 m: seen straight on, too faint at 80 degrees of incidence."""
     facing, grazing = (
-        sensor(wall(1.0, 0.2, yaw), 'vl53l5cx').measure(np.eye(4)[None], ['tof'], 1)[0]
+        TofSensorModel(
+            MODEL, RayCaster(wall(1.0, 0.12, yaw)), 'vl53l5cx', np.random.default_rng(0), IDEAL
+        ).measure(np.eye(4)[None], ['tof'], 1)[0]
         for yaw in (0, 80)
     )
     assert np.isfinite(facing.ranges[MIDDLE]).all()
@@ -360,8 +364,8 @@ def half_and_half(near: float, far: float) -> np.ndarray:
 
 
 def test_an_edge_gives_a_mixed_reading_between_close_surfaces():
-    readings = read(Vl53l5cxReceiver(MODEL, IDEAL), half_and_half(0.50, 0.58))
-    assert 0.51 < np.mean(depths_of(readings)) < 0.57  # 64 zones: 1 mm at one sigma
+    readings = read(Vl53l5cxReceiver(MODEL, IDEAL), half_and_half(0.50, 0.70))
+    assert 0.52 < np.mean(depths_of(readings)) < 0.65  # 64 zones: 1 mm at one sigma
     assert np.all(readings.status == 9)
 
 
@@ -376,32 +380,68 @@ def test_two_far_surfaces_give_the_strongest_or_the_closest(order, expected):
 
 
 def test_light_of_a_bright_zone_drowns_its_faint_neighbours():
-    """
-    One zone at 5 cm leaks into eight neighbours at 2 m.
-
-    They are flagged and carry no range.
-    """
+    """One zone at 5 cm leaks into eight neighbours at 2 m, which then have no target."""
     depth = np.full((64, 1), 2.0)
     depth[27] = 0.05
-    flagged = read(Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'crosstalk': 0.01})), depth)
+    drowned = read(Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'crosstalk': 0.01})), depth)
     around = [27 + 8 * r + c for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-    assert np.flatnonzero(flagged.status[0] == 12).tolist() == sorted(around)
-    assert np.isnan(flagged.ranges[0, around]).all()
+    assert np.flatnonzero(drowned.status[0] == 255).tolist() == sorted(around)
+    assert np.all(drowned.ranges[0, around] == np.inf)
     clean = read(Vl53l5cxReceiver(MODEL, IDEAL), depth)
-    assert not np.any(clean.status == 12)
+    assert not np.any(clean.status == 255)
 
 
-def test_status_tells_the_first_frame_and_a_target_that_has_just_appeared():
+def test_a_target_that_has_just_appeared_is_status_10_and_carries_no_range():
     receiver = Vl53l5cxReceiver(MODEL, IDEAL)
-    assert np.all(read(receiver, 1.0, frames=1).status == 6)
     assert np.all(read(receiver, 1.0, frames=1).status == 5)
     assert np.all(read(receiver, np.inf, frames=1).status == 255)
-    assert np.all(read(receiver, 1.0, frames=1).status == 10)
+    anew = read(receiver, 1.0, frames=1)
+    assert np.all(anew.status == 10) and np.isnan(anew.ranges).all()
+    assert np.all(read(receiver, 1.0, frames=1).status == 5)
 
 
-def test_too_close_is_minus_infinity():
-    readings = read(Vl53l5cxReceiver(MODEL, IDEAL), 0.01)
-    assert np.all(readings.ranges == -np.inf) and np.all(readings.status == 4)
+@pytest.mark.parametrize(('blind', 'status', 'ranges'), [(0.0, 5, -np.inf), (1.0, 255, np.inf)])
+def test_what_stands_right_before_the_sensor_is_too_close_or_none(blind, status, ranges):
+    """At 10 mm a zone that is blind says 255 with a distance of 10 mm, as the real ones do."""
+    receiver = Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'blind': blind}))
+    readings = read(receiver, 0.01)
+    assert np.all(readings.ranges == ranges) and np.all(readings.status == status)
+    assert np.all(np.abs(readings.raw - 0.01) < 0.01)
+
+
+def test_ambient_light_shortens_the_reach_as_the_datasheet_says():
+    """White is seen at 4 m in the dark, at 1.4 m in daylight of 5 klux."""
+    lit = IDEAL.model_copy(update={'ambient': 5.0})
+    assert np.isfinite(read(Vl53l5cxReceiver(MODEL, lit), 0.9 * 1.4).ranges[0, MIDDLE]).all()
+    assert np.all(read(Vl53l5cxReceiver(MODEL, lit), 1.1 * 1.4).status == 255)
+    assert np.isfinite(read(Vl53l5cxReceiver(MODEL, IDEAL), 3.5).ranges[0, MIDDLE]).all()
+
+
+def test_every_unit_has_an_offset_a_scale_and_a_drift_that_dies_out():
+    """
+    200 units before a wall at 2 m, then at 0.5 m, their noise averaged over 64 zones.
+
+    Offsets of 8 mm and scales of 1.5 % scatter by 31 mm at 2 m; the difference between the two
+    distances by 1.5 % of 1.5 m. A drift of 20 mm has gone to 0.3 % of it after six minutes.
+    """
+    biased = IDEAL.model_copy(update={'range_offset': 0.008, 'range_scale': 0.015})
+    names, rng = [f'unit{k}' for k in range(200)], np.random.default_rng(3)
+    receiver = Vl53l5cxReceiver(MODEL, biased)
+
+    def means(receiver: Vl53l5cxReceiver, depth: float) -> np.ndarray:
+        one = uniform_echoes(receiver, depth, 0.88)
+        echoes = Echoes(*(np.repeat(a, 200, axis=0) for a in (one.distance, one.brightness)))
+        return receiver.read(echoes, names, rng).raw.mean(axis=1) - depth
+
+    far, near = means(receiver, 2.0), means(receiver, 0.5)
+    # 200 units: 5 % at one sigma.
+    assert np.std(far) == pytest.approx(np.hypot(0.008, 0.030), rel=0.2)
+    assert np.std(far - near) == pytest.approx(0.0225, rel=0.2)
+    cold = Vl53l5cxReceiver(MODEL, IDEAL.model_copy(update={'warm_up': 0.02}))
+    assert np.std(means(cold, 0.5)) == pytest.approx(0.02, rel=0.2)
+    for unit in cold._units.values():
+        unit.frames = unit.frames + 15 * 360
+    assert np.std(means(cold, 0.5)) < 0.001
 
 
 def test_dropouts_come_at_their_rate():
@@ -455,15 +495,28 @@ def test_the_noise_tests_of_the_study_pass_and_notice_a_wrong_model(monkeypatch)
     from studies import _vl53l5cx
 
     rows = {row['sensor']: row['p_value'] for row in _vl53l5cx.noise(0)}
-    assert len(rows) == 6 and min(rows.values()) > 1e-3
+    assert len(rows) == 7 and min(rows.values()) > 1e-3
     assert _vl53l5cx.mechanisms(0)['wide'] == 1.0
-    # The sensor made a little noisier, deaf to its neighbours, and three times as forgetful; what
-    # the tests expect is still the usual sensor.
+    # The sensor with other noise, deaf to its neighbours, and three times as forgetful; what the
+    # tests expect is still the usual sensor.
     usual = _vl53l5cx.Vl53l5cxReceiver
-    changed = Vl53l5cxSettings(noise_floor=0.004, crosstalk=0.0, dropout=0.006)
-    monkeypatch.setattr(_vl53l5cx, 'Vl53l5cxReceiver', lambda model, *_: usual(model, changed))
+    monkeypatch.setattr(
+        _vl53l5cx,
+        'Vl53l5cxReceiver',
+        lambda model, told=None: usual(
+            model,
+            (told or Vl53l5cxSettings()).model_copy(
+                update={
+                    'faint_noise': 5.0,
+                    'crosstalk': 0.0,
+                    'dropout': 0.009,
+                    'faint': 0.05,
+                    'stray': 0.02,
+                    'range_offset': 0.011,
+                }
+            ),
+        ),
+    )
     rows = {row['sensor']: row['p_value'] for row in _vl53l5cx.noise(0)}
-    assert rows['VL53L5CX depth, wall at 1 m'] < 1e-3
-    assert rows['VL53L5CX depth, edge of 8 cm'] < 1e-3
-    assert rows['VL53L5CX dropouts'] < 1e-3
-    assert rows['VL53L5CX drowned by crosstalk (12)'] < 1e-3
+    for name, p_value in rows.items():
+        assert p_value < 1e-3 or 'new target' in name, name

@@ -8,6 +8,7 @@ SCRIPT = """
 import sys
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
+from continuum_loc.estimator.state import column_at_rest
 from continuum_loc.nodes.support.memory import SeenScene
 from continuum_loc.nodes.support.warm_up import warm_up
 from continuum_loc.settings import parse_settings
@@ -42,9 +43,8 @@ for k, sample in enumerate(samples):
     if k == len(samples) // 2:  # lost: bent elsewhere
         strain = estimator.window.columns[-1].strain.copy()
         strain[:, 4] += 1.5
-        from continuum_loc.estimator.recovery import place
-        column = estimator.window.columns[-1]
-        estimator.window.place(place(estimator.grid, column, column.T[0], strain))
+        time, T, *_ = estimator.window.columns[-1]
+        estimator.window.place(column_at_rest(estimator.grid, T[0], strain, time))
     estimator.process(sample)
 assert searched, 'the body was never lost: nothing was shown'
 late = {name: n for name, n in compiled().items() if n > before.get(name, 0)}

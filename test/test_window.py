@@ -297,11 +297,7 @@ def test_the_batch_smoother_beats_the_filter(prior_map):
 
 
 def test_a_frozen_sensor_is_refused_and_a_wrong_extrinsic_named(prior_map):
-    """
-    A sensor that repeats itself is dropped, and one mounted 20 degrees off is suspected.
-
-    Neither hurts.
-    """
+    """Neither a sensor that repeats itself nor one mounted 20 degrees off does any harm."""
     robot = rod()
     turn = lie.exp(np.radians([0, 0, 0, 0, 0, 20.0]))[:3, :3]
     first: dict = {}

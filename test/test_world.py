@@ -159,11 +159,7 @@ def test_insertion_follows_its_command(engine, truth):
 
 
 def test_tendon_encoders_are_the_change_of_their_channels_length(engine):
-    """
-    A channel at offset r from a bent backbone is shorter by an integral.
-
-    That of r x curvature along x.
-    """
+    """A channel at offset r is shorter by the integral of r x curvature along the backbone."""
     plant = load_plant('engine')
     group = plant.tendons[1]
     last = int(np.argmin(np.abs(engine.nodes_s - group.end)))

@@ -1,68 +1,31 @@
 """
-Least squares on a chain of columns.
+Least squares on a chain of columns: block-tridiagonal elimination, marginals, covariances.
 
-Block-tridiagonal elimination, marginalisation and covariances.
-
-Interval k couples columns k and k + 1 by a quadratic  1/2 [x_k; x_k+1]^T H [x_k; x_k+1] + g^T
-[x_k; x_k+1]  in the columns' offsets x from their linearisation points. Eliminating columns from
-the oldest to the newest leaves on each a *message* (Lambda, eta), all that the past says of it:
+Interval k couples columns k and k + 1 by a `Normal` of [x_k; x_k+1], the columns' offsets from
+their linearisation points. Eliminating columns from the oldest to the newest leaves on each its
+*marginal* (Lambda, eta): all that the past says of it, again a `Normal`.
 
     S_k = Lambda_k + H_aa,
     Lambda_k+1 = H_bb - H_ab^T S_k^-1 H_ab,   eta_k+1 = g_b - H_ab^T S_k^-1 (eta_k + g_a).
 
 Sliding the window on is therefore exact marginalisation: drop the oldest interval and keep the
-message it left. Messages before the first interval that changed are kept from the last solve, and
-covariances come from the same triangular factors (`Cholesky`).
+marginal that it left. Marginals before the first interval that changed are kept from the last
+solve, and covariances come from the same triangular factors (`Cholesky`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import SingularError
-from numba import njit
+from continuum_loc.estimator.normal import Normal
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import blas, lapack
 
 BLOCK = 54  # rows of a factor that are solved at once: three nodes
 Step = tuple[int, slice]
-
-
-@dataclass(slots=True, eq=False)
-class Blocks:
-    """
-    Normal equations of one interval, at its linearisation point.
-
-    H (2 D, 2 D), of which the upper triangle is kept and the rest is zero, g (2 D,), and the cost.
-    """
-
-    H: np.ndarray
-    g: np.ndarray
-    cost: float = 0.0
-
-    @classmethod
-    def zeros(cls, dim: int) -> Blocks:
-        return cls(np.zeros((2 * dim, 2 * dim)), np.zeros(2 * dim))
-
-    def clear(self) -> None:
-        dim = len(self.g) // 2
-        self.H[:dim].fill(0.0)
-        self.H[dim:, dim:].fill(0.0)  # below the diagonal nothing was added
-        self.g.fill(0.0)
-        self.cost = 0.0
-
-
-@dataclass(slots=True, eq=False)
-class Message:
-    """
-    What the past says of a column: information (D, D) and gradient (D,), where linearised.
-
-    Of the information, as of `Blocks`, the upper triangle.
-    """
-
-    information: np.ndarray
-    gradient: np.ndarray
 
 
 class Cholesky:
@@ -127,14 +90,14 @@ class _Elimination:
 class Chain:
     """Elimination of a window's intervals, with what can be kept from one solve to the next."""
 
-    def __init__(self, dim: int, start: Message):
+    def __init__(self, dim: int, start: Normal):
         self.dim = dim
-        self.messages = [start]
+        self.marginals = [start]
         self._eliminated: list[_Elimination] = []
         self._last: tuple[Cholesky, np.ndarray] | None = None
 
     def solve(
-        self, intervals: list[Blocks], first_changed: int, damping: float = 0.0
+        self, intervals: list[Normal], first_changed: int, damping: float = 0.0
     ) -> list[np.ndarray]:
         """Offsets (D,) of all columns. Raises SingularError."""
         self._forward(intervals, first_changed, damping)
@@ -191,39 +154,37 @@ class Chain:
             return self._eliminated[column].factor
         return self._last[0]
 
-    def forget_oldest(self, oldest: Blocks, changed: bool) -> None:
+    def forget_oldest(self, oldest: Normal, changed: bool) -> None:
         """
-        Marginalise the oldest column through its interval.
+        Marginalise the oldest column through its interval: the next one's marginal is the start.
 
-        Its message to the next column becomes the start.
-
-        `changed` says that the interval is not the one of the last solve, so that it must be
+        `changed` says that the interval is not the one of the last solve, so that it has to be
         eliminated anew.
         """
         if changed or not self._eliminated:
-            self.messages[1:], self._eliminated[:] = [], []
+            self.marginals[1:], self._eliminated[:] = [], []
             self._eliminate(oldest, 0, 0.0)
-        del self.messages[0], self._eliminated[0]
+        del self.marginals[0], self._eliminated[0]
 
-    def _forward(self, intervals: list[Blocks], first: int, damping: float) -> None:
+    def _forward(self, intervals: list[Normal], first: int, damping: float) -> None:
         first = min(first, len(self._eliminated))
         kept = first + 1
-        del self.messages[kept:], self._eliminated[first:]
+        del self.marginals[kept:], self._eliminated[first:]
         for k in range(first, len(intervals)):
             self._eliminate(intervals[k], k, damping)
-        newest = self.messages[-1]
-        factor = _factored(newest.information, damping, len(intervals))
-        self._last = (factor, factor.lower(newest.gradient))
+        newest = self.marginals[-1]
+        factor = _factored(newest.H, damping, len(intervals))
+        self._last = (factor, factor.lower(newest.g))
 
-    def _eliminate(self, interval: Blocks, k: int, damping: float) -> None:
-        D, H, g, message = self.dim, interval.H, interval.g, self.messages[k]
-        factor = _factored(message.information + H[:D, :D], damping, k)
+    def _eliminate(self, interval: Normal, k: int, damping: float) -> None:
+        D, (H, g), marginal = self.dim, interval, self.marginals[k]
+        factor = _factored(marginal.H + H[:D, :D], damping, k)
         steps = steps_of(H[:D, D:])
         Y = factor.whiten(H[:D, D:], steps)
-        y = factor.lower(message.gradient + g[:D])
+        y = factor.lower(marginal.g + g[:D])
         information = blas.dsyrk(-1.0, Y.T, beta=1.0, c=H[D:, D:].T, lower=1).T
         self._eliminated.append(_Elimination(factor, Y, y, steps))
-        self.messages.append(Message(information, g[D:] - Y.T @ y))
+        self.marginals.append(Normal(information, g[D:] - Y.T @ y))
 
 
 def _factored(S: np.ndarray, damping: float, column: int) -> Cholesky:
@@ -245,16 +206,6 @@ def _squares(X: np.ndarray, size: int, step: int) -> np.ndarray:
     return groups.transpose(1, 2, 0) @ groups.transpose(1, 0, 2)
 
 
-def symmetric(H: np.ndarray) -> np.ndarray:
-    """Whole of a symmetric matrix whose upper triangle H (n, n) is."""
-    return H + np.triu(H, 1).T
-
-
-def half_square(H: np.ndarray, x: np.ndarray) -> float:
-    """x^T H x / 2 of a symmetric matrix whose upper triangle H (n, n) is."""
-    return float(x @ (H @ x) - 0.5 * (np.diagonal(H) @ np.square(x)))
-
-
 def steps_of(B: np.ndarray) -> list[Step]:
     """
     Where the columns of B (D, m) begin: (first row of a block, columns zero in all rows above).
@@ -269,7 +220,7 @@ def steps_of(B: np.ndarray) -> list[Step]:
     ]
 
 
-@njit(cache=True)
+@kernel
 def _reaches(B, rows):
     """Columns of B (D, m) up to the last that is not zero in each block of `rows` or above."""
     blocks = (B.shape[0] + rows - 1) // rows

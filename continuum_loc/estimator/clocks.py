@@ -128,7 +128,7 @@ def _gather(window: Window, factors: Sequence[Factor]):
         for factor in factors:
             scores = interval.clock_scores(factor, window.columns[k], window.columns[k + 1])
             if scores is not None:
-                at = [names.setdefault(name, len(names)) for name in scores.sensors]
+                at = [names.setdefault(name, len(names)) for name in factor.sensors]
                 parts.append((k, at, scores))
     columns, dim, sensors = len(window.columns), window.grid.dim, len(names)
     g, h, C = np.zeros(sensors), np.zeros(sensors), np.zeros((columns, dim, sensors))

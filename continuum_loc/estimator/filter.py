@@ -2,7 +2,7 @@
 The sliding-window filter: start reading here.
 
 A measurement enters by `process`. Its stamp puts it into the interval between two knots of the
-`Window`; when a cycle of ToF frames is complete (or `output_rate` says so) the window is solved
+`Window`; when a `Cycle` of ToF frames is complete (or `output_rate` says so) the window is solved
 and an `Estimate` comes out. `Recovery` notices a body in a wrong minimum and finds it again.
 """
 
@@ -15,29 +15,23 @@ import time as clock
 
 from continuum_loc.errors import MeasurementError, SingularError
 from continuum_loc.estimate import Estimate
-from continuum_loc.estimator.factors import Factor, FACTORS, TofFactor
+from continuum_loc.estimator.cycle import Cycle
+from continuum_loc.estimator.factors import Factor, FACTORS, Guess, Setup
+from continuum_loc.estimator.fit import Fit, fit_of, rattle
 from continuum_loc.estimator.health import Health
-from continuum_loc.estimator.output import backbone, BodyState, rattle_covariance
+from continuum_loc.estimator.interpolation import backbone, BodyState, rattle_covariance
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
-from continuum_loc.estimator.recovery import place, Recovery
+from continuum_loc.estimator.recovery import Recovery
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import column_at_rest, Grid
-from continuum_loc.estimator.window import Fit, TIME_EPSILON, Window
-from continuum_loc.measurements import (
-    EncoderSample,
-    Measurement,
-    nanoseconds,
-    seconds,
-    StrainSample,
-    TofFrame,
-)
+from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
+from continuum_loc.estimator.window import Window
+from continuum_loc.measurements import Measurement, nanoseconds, seconds
 from continuum_loc.robot import RobotDescription
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-PATIENCE = 1.5  # ToF periods that a cycle waits for silent sensors
 FIRST_PATIENCE = 0.5  # [s] that the first step waits for what tells base and shape
 
 
@@ -56,21 +50,8 @@ class SlidingWindowFilter:
         self.settings = settings or EstimatorSettings()
         self.grid = Grid(robot, self.settings.node_spacing)
         self.priors = Priors(robot, self.grid, self.settings)
-        self.tof = self._make_tof(prior_map)
-        self.factors: list[Factor] = [
-            kind(robot, self.grid, self.settings)
-            for kind in FACTORS
-            if kind.name == 'insertion' or getattr(self.settings, kind.name).enabled
-        ]
-        if self.tof is not None:
-            self.factors.append(self.tof)
-        self._factors_of: dict[type, list[Factor]] = {}
-        self.counts = {
-            'received': Counter(),
-            'used': Counter(),
-            'dropped': Counter(),
-            'restarts': Counter(),
-        }
+        self.setup = Setup(robot, self.grid, self.settings, prior_map)
+        self.counts = {kind: Counter() for kind in ('received', 'used', 'dropped', 'restarts')}
         s_imu = {imu.name: robot.sensor_arclength(imu.name) for imu in robot.imu}
         self._s_imu = dict(sorted(s_imu.items(), key=itemgetter(1)))
         self._backbone_s = np.linspace(0.0, robot.length, self.settings.backbone_points)
@@ -81,36 +62,17 @@ class SlidingWindowFilter:
         """Forget everything but the counts; the next measurement starts anew."""
         self.epoch: int | None = None
         self.newest: int = 0
+        self.factors = [kind(self.setup) for kind in FACTORS if kind.wanted(self.setup)]
+        self._factors_of: dict[type, list[Factor]] = {}
+        self._awaited = {factor.consumes for factor in self.factors if factor.awaited()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
         self.health = Health(self.robot, self.window, self.factors, self.settings.health)
         self.recovery = Recovery(
-            self.robot, self.window, self.tof, self.health, self.settings.recovery
+            self.robot, self.window, self.factors, self.health, self.settings.recovery
         )
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
-        self._awaited = self._tellers()
-        self._cycle: set[str] = set()
-        self._last_cycle: set[str] = set()
-        self._cycle_start: int | None = None
-        self._cycle_stamp: int = 0
-        self._output: int = 0
-
-    def _tellers(self) -> set[type]:
-        """Kinds of samples without which the first guess of base and shape is a poor one."""
-        tellers: set[type] = set()
-        if self.robot.base.insertion.mode == 'measured':
-            tellers.add(EncoderSample)
-        if self.robot.strain is not None and self.settings.strain.enabled:
-            tellers.add(StrainSample)
-        return tellers
-
-    def _make_tof(self, prior_map) -> TofFactor | None:
-        if prior_map is None or not self.settings.tof.enabled or not self.robot.tof:
-            return None
-        from continuum_loc.mapping.voxel_index import VoxelIndex
-
-        index = VoxelIndex(prior_map.points, prior_map.normals, reach=self.settings.tof.gate)
-        return TofFactor(self.robot, self.grid, self.settings, prior_map, index)
+        self._cycle = Cycle(self.factors, self.settings.output_rate)
 
     # -------------------------------------------------------------- measurements in, estimates out
 
@@ -121,14 +83,14 @@ class SlidingWindowFilter:
         Measurements that cannot be used are counted.
         """
         self.counts['received'][type(measurement).__name__] += 1
-        estimate = self._step() if self._cycle_over(measurement) else None
-        if self._admit(measurement) and self._cycle_complete(measurement):
+        estimate = self._step() if self._cycle.over(measurement) else None
+        if self._admit(measurement) and self._cycle.complete(measurement):
             estimate = self._step()
         return estimate
 
     def flush(self) -> Estimate | None:
         """Solve what is pending at the end of the data."""
-        return self._step() if self._cycle_start is not None else None
+        return self._step() if self._cycle.running else None
 
     def query(self, stamp: int, s: float) -> BodyState:
         """
@@ -158,8 +120,8 @@ class SlidingWindowFilter:
         first, last = self.window.columns[0].time, seconds(self.newest, self.epoch)
         with self._threads.limit(limits=1, user_api='blas'):
             self.window.mark_changed()
-            iterations, converged = self.recovery.acquire()
-            fit, out = self.window.fit(), []
+            outcome = self.recovery.acquire()
+            fit, out = fit_of(self.window.intervals), []
             for stamp in stamps:
                 time = seconds(stamp, self.epoch)
                 if not first - TIME_EPSILON <= time <= last + TIME_EPSILON:
@@ -167,7 +129,7 @@ class SlidingWindowFilter:
                         f'stamp {stamp} is outside the window, '
                         f'{self.epoch + nanoseconds(first)} to {self.newest} ns'
                     )
-                out.append(self._compose(time, fit, iterations, converged, started, None))
+                out.append(self._compose(time, fit, outcome, started))
         return out
 
     def _admit(self, measurement: Measurement) -> bool:
@@ -209,104 +171,63 @@ class SlidingWindowFilter:
         strain = np.tile(self.priors.rest, (self.grid.nodes, 1))
         self.window.start(column_at_rest(self.grid, self.priors.T_map_base, strain, 0.0))
 
-    def _cycle_over(self, measurement: Measurement) -> bool:
-        """Whether a cycle that began can wait no longer for the sensors that are missing in it."""
-        if self._cycle_start is None or measurement.stamp <= self._cycle_start:
-            return False
-        period = (
-            1.0 / self.settings.output_rate
-            if self.tof is None
-            else PATIENCE / self.robot.tof_model.rate
-        )
-        again = isinstance(measurement, TofFrame) and measurement.sensor in self._cycle
-        return again or seconds(measurement.stamp, self._cycle_start) >= period - TIME_EPSILON
-
-    def _cycle_complete(self, measurement: Measurement) -> bool:
-        """
-        Note the measurement in the running cycle.
-
-        True when every ToF sensor of the last cycle has spoken.
-        """
-        self._cycle_start = self._cycle_start or measurement.stamp
-        if self.tof is None or not isinstance(measurement, TofFrame):
-            return False
-        if not self._cycle and measurement.stamp <= self._output:
-            # A straggler of what was put out begins no cycle, which would be split as that one
-            # was and lack its sensors for ever; the next one waits for it.
-            self._last_cycle.add(measurement.sensor)
-            return False
-        self._cycle.add(measurement.sensor)
-        self._cycle_stamp = max(self._cycle_stamp, measurement.stamp)
-        return (
-            bool(self._last_cycle)
-            and self._cycle >= self._last_cycle
-            or len(self._cycle) == len(self.robot.tof)
-        )
-
     # ------------------------------------------------------------------ one step
 
     def _step(self) -> Estimate | None:
-        # The ToF frames set the time: a clock that runs ahead of theirs must not.
-        self._output = max(self._cycle_stamp if self._cycle else self.newest, self._output)
-        self._last_cycle, self._cycle, self._cycle_start = self._cycle, set(), None
+        output = self._cycle.finish(self.newest)
         early = seconds(self.newest, self.epoch) < FIRST_PATIENCE
         if not self.window.intervals or (self._awaited and early):
             return None
         started = clock.perf_counter()
         with self._threads.limit(limits=1, user_api='blas'):
             # Small matrices: more threads only wait for one another.
-            iterations, converged = self._solve()
-            return self._estimate(iterations, converged, started)
+            time = seconds(output, self.epoch)
+            return self._estimate(time, self._solve(time), started)
 
-    def _solve(self) -> tuple[int, bool]:
-        time = seconds(self._output, self.epoch)
+    def _solve(self, time: float) -> tuple[int, bool]:
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
-            self._guess_shape()
+            self._guess()
         try:
-            iterations, converged = (
+            outcome = (
                 self.window.track(time) if self.recovery.acquired else self.recovery.acquire()
             )
         except SingularError:
             self.counts['restarts']['singular'] += 1
             self.window.keep_newest(1)
-            iterations, converged = self.recovery.acquire()
+            outcome = self.recovery.acquire()
         self._rest.finish(self.window, time)
-        self.recovery.look_after(time, converged)
+        self.recovery.look_after(time, outcome[1])
         self.history.note(self.window)
-        return iterations, converged
+        return outcome
 
-    def _guess_shape(self) -> None:
-        """
-        Start from the first strain and insertion measured, where there are any.
-
-        Without them the guess is straight.
-        """
+    def _guess(self) -> None:
+        """Start from what the first samples tell of base and shape; straight without them."""
         column = self.window.columns[0]
-        strain, T_base = column.strain.copy(), column.T[0]
+        guess = Guess(column.T[0], column.strain.copy())
         for factor in self.factors:
-            rows = self.window.newest_rows(factor, 1)
-            if factor.name == 'strain' and rows:
-                s, bending, _ = rows[0]
-                order = np.argsort(s)
-                for i in range(2):
-                    strain[:, 4 + i] = np.interp(self.grid.s, s[order], bending[order, i])
-            if factor.name == 'insertion' and rows:
-                T_base = rows[0][1]
-        self.window.place(place(self.grid, column, T_base, strain))
+            for row in self.window.intervals[-1].rows(factor)[:1]:
+                factor.guess(row, guess)
+        self.window.place(
+            column_at_rest(self.grid, guess.T_map_base, guess.strain, column.time, column.bias)
+        )
 
     # ------------------------------------------------------------------ the output
 
-    def _estimate(self, iterations: int, converged: bool, started: float) -> Estimate:
-        now = seconds(self._output, self.epoch)
-        before = now - self.settings.lag
-        lagged, fit = None, self.window.fit()
+    def _estimate(self, now: float, outcome: tuple[int, bool], started: float) -> Estimate:
+        before, lagged, fit = now - self.settings.lag, None, fit_of(self.window.intervals)
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
-            lagged = self._compose(before, fit, iterations, converged, started, None)
-        return self._compose(now, fit, iterations, converged, started, lagged)
+            lagged = self._compose(before, fit, outcome, started)
+        return self._compose(now, fit, outcome, started, lagged)
 
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:
-        """Covariance (m, 6, 6) at s (m,) of what gyros feel and the motion of the knots misses."""
-        variances = self.window.rattle(time)
+        """
+        Covariance (m, 6, 6) at s (m,) of what gyros feel and the motion of the knots misses.
+
+        The larger of the interval's that holds `time` and the one before: the newest may have
+        just begun.
+        """
+        k = self.window.knot_before(time)
+        variances = rattle(self.window.intervals[max(k - 1, 0) : k + 1])
         s_imu = {name: self._s_imu[name] for name in self._s_imu if name in variances}
         turns = np.sqrt([variances[name] for name in s_imu]).reshape(-1, 3)
         return rattle_covariance(np.array(list(s_imu.values())), turns, s)
@@ -315,10 +236,9 @@ class SlidingWindowFilter:
         self,
         time: float,
         fit: Fit,
-        iterations: int,
-        converged: bool,
+        outcome: tuple[int, bool],
         started: float,
-        lagged: Estimate | None,
+        lagged: Estimate | None = None,
     ) -> Estimate:
         rings, body = self.grid.ring_nodes, self.window.body(time)
         covariance = self.window.motion_covariance(time, rings)
@@ -338,8 +258,8 @@ class SlidingWindowFilter:
             consistency=fit.squared / max(fit.count, 1),
             inliers=fit.shares,
             suspects=dict(self.health.reasons),
-            iterations=iterations,
-            converged=converged,
+            iterations=outcome[0],
+            converged=outcome[1],
             step_seconds=clock.perf_counter() - started,
             lagged=lagged,
         )

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from continuum_loc.estimator.clocks import ClockEvidence, ClockOffset
 from continuum_loc.estimator.factors import Factor
+from continuum_loc.estimator.fit import fit_of, flicker
 from continuum_loc.estimator.settings import HealthSettings
 from continuum_loc.estimator.window import Window
 from continuum_loc.robot import RobotDescription
@@ -28,9 +29,9 @@ NOISY, MISFIT = 'noisy', 'does not fit'
 
 class Health:
     """
-    Watches over a robot's sensors.
+    Watches over a robot's sensors, and tells the factors how much each counts.
 
-    reasons: why each suspect is one, by name. How much each sensor counts is told its factor.
+    reasons: why each suspect is one, by name.
     """
 
     def __init__(
@@ -42,10 +43,9 @@ class Health:
     ):
         self.reasons: dict[str, str] = {}
         self._robot, self._window, self._factors, self._settings = robot, window, factors, settings
-        self._weights = [factor.weights for factor in factors]
         self._heard: dict[str, float] = {}
-        weighed = set().union(*self._weights)
-        self._tof_names = [sensor.name for sensor in robot.tof if sensor.name in weighed]
+        used = {name for factor in factors for name in factor.sensors}
+        self._tof_names = [sensor.name for sensor in robot.tof if sensor.name in used]
         self._kinds = (self._tof_names, [sensor.name for sensor in robot.imu])
         self._clock_groups = self._groups()
         self._votes: dict[tuple[str, ...], int] = {}
@@ -85,8 +85,9 @@ class Health:
 
     def _misfits(self) -> list[str]:
         """Sensors that do not fit while others of their kind do: a wrong mount, a broken part."""
-        shares, misfits = self._window.fit().shares, []
-        recent = self._window.fit(newest=RECENT).shares  # a knocked ToF sensor shows at once
+        intervals, misfits = self._window.intervals, []
+        shares = fit_of(intervals).shares
+        recent = fit_of(intervals[-RECENT:]).shares  # a knocked ToF sensor shows at once
         shares |= {name: recent[name] for name in self._tof_names if name in recent}
         for kind in self._kinds:
             names = [name for name in kind if name in shares]
@@ -98,8 +99,8 @@ class Health:
 
     def _noisy(self) -> list[str]:
         """Name sensors whose zones match the map in one frame and not in the next."""
-        flicker = self._window.flicker()
-        return [name for name, share in flicker.items() if share > self._settings.flicker_share]
+        shares = flicker(self._window.intervals)
+        return [name for name, share in shares.items() if share > self._settings.flicker_share]
 
     def _silent(self, time: float) -> list[str]:
         """Sensors without a usable sample for long while others of their kind speak."""
@@ -158,12 +159,9 @@ class Health:
 
     def _count(self) -> None:
         """Have disbelieved sensors count little, the measurements in the window included."""
-        doubted, changed = self.disbelieved, False
-        for weights in self._weights:
-            for name, before in weights.items():
-                weights[name] = self._settings.suspect_weight if name in doubted else 1.0
-                changed |= weights[name] != before
-        if changed:
+        doubted, weight = self.disbelieved, self._settings.suspect_weight
+        changed = [factor.weigh(doubted, weight) for factor in self._factors]
+        if any(changed):
             self._window.mark_changed()
 
 

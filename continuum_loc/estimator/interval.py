@@ -1,31 +1,32 @@
-"""
-The stretch between two knots.
-
-Its measurements, and their normal equations at the current linearisation.
-"""
+"""The stretch between two knots: its measurements, and their normal equations where linearised."""
 
 from __future__ import annotations
 
-from continuum_loc.estimator.chain import Blocks, half_square
 from continuum_loc.estimator.factors import ClockScores, Factor, FactorReport
+from continuum_loc.estimator.normal import Normal
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Column
 import numpy as np
 
 
 class Interval:
-    """Measurements with stamps in (start, start + duration], by factor, and their `Blocks`."""
+    """
+    Measurements with stamps in (start, start + duration], by factor, and what they come to.
+
+    normal, cost: at the current linearisation; reports: how each factor's measurements fit there;
+    jerked: (N,) what the process noise of each node is multiplied by; changed: to be linearised
+    anew.
+    """
 
     def __init__(self, start: float, dim: int, nodes: int):
-        self.start = start
-        self.blocks = Blocks.zeros(dim)
-        self.reports: dict[str, FactorReport] = {}
-        self.changed = True
-        self.jerked = np.ones(nodes)  # what the process noise of each node is multiplied by
+        self.start, self.changed = start, True
+        self.normal, self.cost = Normal.zeros(2 * dim), 0.0
+        self.reports: dict[Factor, FactorReport] = {}
+        self.jerked = np.ones(nodes)
         self._times: dict[Factor, list[float]] = {}
         self._rows: dict[Factor, list[tuple]] = {}
         self._batches: dict[Factor, tuple] = {}
-        self._scores: dict[Factor, ClockScores | None] = {}  # at the current linearisation
+        self._scores: dict[Factor, ClockScores | None] = {}
 
     def add(self, factor: Factor, time: float, row: tuple) -> None:
         """Take a factor's row at `time` [s since the filter's epoch]."""
@@ -40,15 +41,15 @@ class Interval:
 
     def linearise(self, priors: Priors, a: Column, b: Column) -> None:
         """Build the normal equations at the columns a and b."""
-        self.blocks.clear()
+        self.normal.clear()
         self._scores.clear()
-        self.jerked = priors.add(self.blocks, a, b)
+        self.cost, self.jerked = priors.add(self.normal, a, b)
         for factor, rows in self._rows.items():
             if factor not in self._batches:
                 self._batches[factor] = factor.stack(np.array(self._times[factor]), rows)
-            report = factor.linearise(self._batches[factor], a, b, self.blocks)
-            self.reports[factor.name] = report
-            self.blocks.cost += report.cost
+            report = factor.linearise(self._batches[factor], a, b, self.normal)
+            self.reports[factor] = report
+            self.cost += report.cost
         self.changed = False
 
     def clock_scores(self, factor: Factor, a: Column, b: Column) -> ClockScores | None:
@@ -60,4 +61,4 @@ class Interval:
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
         """Cost that the quadratic model gives at offsets from the linearisation point."""
         x = np.concatenate([offset_a, offset_b])
-        return self.blocks.cost + float(self.blocks.g @ x) + half_square(self.blocks.H, x)
+        return self.cost + float(self.normal.g @ x) + self.normal.half_square(x)

@@ -1,22 +1,32 @@
 """
-Prior factors of one interval.
-
-The Gaussian process in time and in arclength, rest strain, base and bias.
+Prior factors of one interval: the Gaussian process in time and arclength, rest strain, base, bias.
 
 An interval holds the time prior between its two columns and the factors of the *newer* column
-alone (its space prior, rest strain, base); those of the very first column are in the start
-message. So each factor stands once.
+alone (its space prior, rest strain, base); those of the very first column are in the start of the
+chain. So each factor stands once.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from continuum_loc import lie, lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.chain import Blocks, Message
+from continuum_loc.estimator.normal import add_rows, Normal
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE, STRAIN, VELOCITY
+from continuum_loc.estimator.state import (
+    Column,
+    ends_along,
+    ends_in_time,
+    Grid,
+    NODE_DIM,
+    rows_along,
+    rows_in_time,
+    STRAIN,
+    VELOCITY,
+)
 from continuum_loc.robot import RobotDescription
-from numba import njit
 import numpy as np
 
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
@@ -24,142 +34,122 @@ BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
 MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in motion
 
 
+class InTime(NamedTuple):
+    """The prior from knot to knot: inverse densities of its noise, and its loss."""
+
+    inverse_velocity_psd: np.ndarray  # (N, 6)
+    inverse_strain_psd: np.ndarray  # (6,)
+    inverse_bias_psd: float
+    cauchy: float
+    least: float  # one over the most that a jerk multiplies the noise by
+
+
+class OfColumn(NamedTuple):
+    """The prior of one column: in arclength s (N,), of its rest strain and of its base."""
+
+    s: np.ndarray
+    inverse_strain_psd: np.ndarray  # (N - 1, 6) of its slope
+    inverse_velocity_psd: np.ndarray  # (6,) of its slope
+    rest: np.ndarray  # (6,)
+    rest_information: np.ndarray  # (6,)
+    T_map_base: np.ndarray  # (4, 4)
+    base_information: np.ndarray  # (2, 6) of the base's pose and of its velocity
+
+
 class Priors:
     """
     The prior of a robot with given settings, on a grid.
 
-    velocity_psd (N, 6) by node and strain_psd (N - 1, 6) by segment: the process noise.
+    velocity_psd (N, 6) by node, strain_rate_psd (6,) and strain_psd (N - 1, 6) by segment: the
+    process noise. rest: (6,) strain and T_map_base: (4, 4) of the body before any measurement.
     """
 
     def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
-        prior = settings.prior
-        self.grid = grid
-        self.memory, self.cauchy, self.jerked = prior.memory, prior.cauchy, prior.jerked
-        self.s = grid.s
+        prior, gyro = settings.prior, settings.gyro
+        self.grid, self.memory = grid, prior.memory
         self.rest = np.array(robot.backbone.rest_strain)
-        self.rest_information = 1.0 / np.square(robot.backbone.rest_strain_sigma)
-        grown = (
-            prior.velocity_at_base + (1.0 - prior.velocity_at_base) * (grid.s / grid.s[-1]) ** 2
-        )
+        share = prior.velocity_at_base
+        grown = share + (1.0 - share) * (grid.s / grid.s[-1]) ** 2
         self.velocity_psd = grown[:, None] * np.array(prior.velocity)
-        self.velocity = 1.0 / self.velocity_psd
-        self.strain_rate = 1.0 / np.array(prior.strain_rate)
+        self.inverse_strain_rate_psd = 1.0 / np.array(prior.strain_rate)
         step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
         self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
-        self.strain = 1.0 / self.strain_psd
-        self.velocity_slope = 1.0 / np.array(prior.velocity_slope)
-        self.bias_rate = 1.0 / settings.gyro.bias_walk**2
-        self.bias_information = 1.0 / settings.gyro.bias_sigma**2
-        self.initial_velocity = np.repeat(1.0 / np.square(prior.initial_velocity_sigma), 3)
-        self._set_base(robot)
+        self.T_map_base, base_information = _base_of(robot)
+        self._work = gp.new_workspace()
+        self._bias_information = 1.0 / gyro.bias_sigma**2
+        self._initial_velocity = np.repeat(1.0 / np.square(prior.initial_velocity_sigma), 3)
+        self._in_time = InTime(
+            1.0 / self.velocity_psd,
+            self.inverse_strain_rate_psd,
+            1.0 / gyro.bias_walk**2,
+            prior.cauchy,
+            1.0 / prior.jerked,
+        )
+        self._of_column = OfColumn(
+            grid.s,
+            1.0 / self.strain_psd,
+            1.0 / np.array(prior.velocity_slope),
+            self.rest,
+            1.0 / np.square(robot.backbone.rest_strain_sigma),
+            self.T_map_base,
+            base_information,
+        )
 
-    def _set_base(self, robot: RobotDescription) -> None:
-        base, insertion = robot.base, robot.base.insertion
-        middle = 0.0 if insertion.mode == 'fixed' else float(np.mean(insertion.range))
-        self.T_map_base = base.T_map_base @ lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
-        sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
-        rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
-        if insertion.mode != 'fixed':
-            sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
-            rate[0] = 1.0
-        self.base_information, self.base_rate_information = sigma**-2.0, rate**-2.0
-
-    def start(self, column: Column, moving: bool = False) -> Message:
+    def start(self, column: Column, moving: bool = False) -> Normal:
         """
-        Return the first column's own factors, linearised there.
-
-        They are what is known before any measurement.
+        Return the first column's own factors, linearised there: what is known beforehand.
 
         `moving` loosens the velocity, for a body found in the middle of its motion.
         """
-        velocity = self.initial_velocity * (MOVING_FACTOR**-2 if moving else 1.0)
-        D = self.grid.dim
-        H, g = np.zeros((D, D)), np.zeros(D)
-        self._add_column(H, g, column, 1.0)
+        velocity = self._initial_velocity * (MOVING_FACTOR**-2 if moving else 1.0)
+        start = Normal.zeros(self.grid.dim)
+        _add_column(start, column, self._of_column, 1.0, self._work)
         for n in range(self.grid.nodes):
             at = slice(NODE_DIM * n + VELOCITY, NODE_DIM * n + VELOCITY + 6)
-            H[at, at] += np.diag(velocity)
-            g[at] += velocity * column.velocity[n]
-        biases = np.arange(self.grid.bias_offset, D)
-        H[biases, biases] += self.bias_information
-        return Message(H, g)
+            start.H[at, at] += np.diag(velocity)
+            start.g[at] += velocity * column.velocity[n]
+        biases = np.arange(self.grid.bias_offset, self.grid.dim)
+        start.H[biases, biases] += self._bias_information
+        return start
 
-    def add(self, blocks: Blocks, a: Column, b: Column) -> np.ndarray:
+    def add(self, normal: Normal, a: Column, b: Column) -> tuple[float, np.ndarray]:
         """
-        Add the interval's time prior and the newer column's own factors; the cost too.
+        Add the interval's time prior and the newer column's own factors.
 
-        Returns what the process noise of each node (N,) was multiplied by.
+        Returns their cost, and what the process noise of each node (N,) was multiplied by. Rest
+        strain and base pose are one observation per `memory`, not one per knot: a knot counts
+        them by its share of that time.
         """
-        dt, D = b.time - a.time, self.grid.dim
-        jerked = np.empty(self.grid.nodes)
-        cost = _add_time(
-            blocks.H,
-            blocks.g,
-            a.T,
-            a.velocity,
-            a.strain,
-            b.T,
-            b.velocity,
-            b.strain,
-            dt,
-            self.velocity,
-            self.strain_rate,
-            self.cauchy,
-            1.0 / self.jerked,
-            jerked,
-        )
-        _add_bias(blocks.H, blocks.g, a.bias, b.bias, self.bias_rate / dt, self.grid.bias_offset)
-        own = self._add_column(blocks.H[D:, D:], blocks.g[D:], b, min(dt / self.memory, 1.0))
-        blocks.cost += cost + 0.5 * own
-        return jerked
-
-    def _add_column(self, H: np.ndarray, g: np.ndarray, column: Column, share: float) -> float:
-        """
-        Space prior, rest strain and base of one column.
-
-        Rest strain and base pose are one observation each, not one per knot: a knot counts them by
-        its `share` of the prior's memory.
-        """
-        squared = _add_space(
-            H,
-            g,
-            column.T,
-            column.strain,
-            column.velocity,
-            self.s,
-            self.strain,
-            self.velocity_slope,
-            self.rest,
-            self.rest_information * share,
-        )
-        return squared + _add_base(
-            H,
-            g,
-            column.T[0],
-            column.velocity[0],
-            self.T_map_base,
-            self.base_information * share,
-            self.base_rate_information * share,
-        )
+        share, jerked = min((b.time - a.time) / self.memory, 1.0), np.empty(self.grid.nodes)
+        priors = self._in_time, self._of_column
+        return _add(normal, a, b, *priors, share, jerked, self._work), jerked
 
 
-@njit(cache=True)
-def _add_time(
-    H,
-    g,
-    T_a,
-    v_a,
-    eps_a,
-    T_b,
-    v_b,
-    eps_b,
-    dt,
-    velocity_information,
-    strain_information,
-    cauchy,
-    least,
-    jerked,
-):
+def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of the base in the middle of its travel, and `OfColumn.base_information`."""
+    base, insertion = robot.base, robot.base.insertion
+    middle = 0.0 if insertion.mode == 'fixed' else float(np.mean(insertion.range))
+    sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
+    rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
+    if insertion.mode != 'fixed':
+        sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
+        rate[0] = 1.0
+    along = lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
+    return base.T_map_base @ along, np.stack([sigma**-2.0, rate**-2.0])
+
+
+@kernel
+def _add(normal, a, b, in_time, of_column, share, jerked, work):
+    """Add all factors of an interval; returns their cost."""
+    dim = normal.g.shape[0] // 2
+    cost = _add_time(normal, a, b, in_time, jerked, work)
+    _add_bias(normal, a, b, in_time.inverse_bias_psd / (b.time - a.time))
+    newer = Normal(normal.H[dim:, dim:], normal.g[dim:])
+    return cost + 0.5 * _add_column(newer, b, of_column, share, work)
+
+
+@kernel
+def _add_time(normal, a, b, prior, jerked, work):
     """
     Add each node's step from knot to knot, under a Cauchy loss; returns the robust cost.
 
@@ -167,104 +157,100 @@ def _add_time(
     the settings' for a body that moves as usual, and grows where it is jerked, up to 1 / least;
     jerked (N,) gets by how much.
     """
-    W, V, M = lie_kernels.workspace()
     e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
     information, walk = np.empty(6), np.empty(6)
-    size = H.shape[0] // 2
-    cost, c2 = 0.0, NODE_DIM * cauchy * cauchy
-    for n in range(T_a.shape[0]):
-        gp.motion_error(T_a[n], v_a[n], T_b[n], v_b[n], dt, e, J, W, V, M)
-        squared = gp.motion_squared(e, dt, velocity_information[n])
+    dim, dt, least = normal.g.shape[0] // 2, b.time - a.time, prior.least
+    cost, c2 = 0.0, NODE_DIM * prior.cauchy * prior.cauchy
+    for n in range(a.T.shape[0]):
+        gp.motion_error(ends_in_time(a, b, n), e, J, work)
+        squared = gp.motion_squared(e, dt, prior.inverse_velocity_psd[n])
         for i in range(6):
-            walk[i] = eps_b[n, i] - eps_a[n, i]
-            squared += strain_information[i] / dt * walk[i] * walk[i]
+            walk[i] = b.strain[n, i] - a.strain[n, i]
+            squared += prior.inverse_strain_psd[i] / dt * walk[i] * walk[i]
         robust = max(1.0 / (1.0 + squared / c2), least)
         jerked[n] = 1.0 / robust
         lossy = min(squared, c2 * (1.0 / least - 1.0))  # beyond it the loss is a square again
         cost += 0.5 * (c2 * np.log1p(lossy / c2) + least * (squared - lossy))
         for i in range(6):
-            information[i] = robust * velocity_information[n, i]
-        gp.time_index(n, VELOCITY, size, index)
-        gp.add_motion(H, g, index, e, J, dt, information)
+            information[i] = robust * prior.inverse_velocity_psd[n, i]
+        rows_in_time(n, dim, index)
+        gp.add_motion(normal, index, e, J, dt, information)
         for i in range(6):
-            older = NODE_DIM * n + STRAIN + i
-            newer = older + size
-            weight = robust * strain_information[i] / dt
-            H[older, older] += weight
-            H[newer, newer] += weight
-            H[older, newer] -= weight
-            g[older] -= weight * walk[i]
-            g[newer] += weight * walk[i]
+            weight = robust * prior.inverse_strain_psd[i] / dt
+            _add_step(normal, NODE_DIM * n + STRAIN + i, weight, walk[i])
     return cost
 
 
-@njit(cache=True)
-def _add_space(
-    H, g, T, strain, velocity, s, strain_information, slope_information, rest, rest_information
-):
-    W, V, M = lie_kernels.workspace()
-    e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
-    weights = np.empty(6)
-    squared = 0.0
-    for n in range(T.shape[0]):
-        for i in range(6):
-            off = strain[n, i] - rest[i]
-            row = NODE_DIM * n + STRAIN + i
-            H[row, row] += rest_information[i]
-            g[row] += rest_information[i] * off
-            squared += rest_information[i] * off * off
-        if n == T.shape[0] - 1:
-            break
-        ds = s[n + 1] - s[n]
-        gp.motion_error(T[n], strain[n], T[n + 1], strain[n + 1], ds, e, J, W, V, M)
-        _segment_index(n, STRAIN, index)
-        squared += gp.add_motion(H, g, index, e, J, ds, strain_information[n])
-        gp.transport_error(T[n], velocity[n], T[n + 1], velocity[n + 1], e[:6], J[:6], W, V, M)
-        _segment_index(n, VELOCITY, index)
-        for i in range(6):
-            weights[i] = slope_information[i] / ds
-        squared += gp.add_rows(H, g, index, e[:6], J[:6], weights)
-    return squared
+@kernel
+def _add_step(normal, older, weight, step):
+    """Add the random walk of one entry of a column, which went by `step` to the newer one."""
+    newer = older + normal.g.shape[0] // 2
+    normal.H[older, older] += weight
+    normal.H[newer, newer] += weight
+    normal.H[older, newer] -= weight
+    normal.g[older] -= weight * step
+    normal.g[newer] += weight * step
 
 
-@njit(cache=True)
-def _add_base(H, g, T, velocity, T_map_base, information, rate_information):
-    W, V, M = lie_kernels.workspace()
-    e, J = np.empty(6), np.empty((6, 6))
-    lie_kernels.pose_error(T_map_base, T, e, J, W, V, M)
-    squared = 0.0
-    for i in range(6):
-        squared += information[i] * e[i] * e[i] + rate_information[i] * velocity[i] * velocity[i]
-        for j in range(6):
-            weighted = information[i] * J[i, j]
-            g[j] += weighted * e[i]
-            for k in range(j, 6):
-                H[j, k] += weighted * J[i, k]
-        H[VELOCITY + i, VELOCITY + i] += rate_information[i]
-        g[VELOCITY + i] += rate_information[i] * velocity[i]
-    return squared
-
-
-@njit(cache=True)
-def _add_bias(H, g, bias_a, bias_b, weight, bias_offset):
-    size = H.shape[0] // 2
-    for m in range(bias_a.shape[0]):
+@kernel
+def _add_bias(normal, a, b, weight):
+    for m in range(a.bias.shape[0]):
         for i in range(3):
-            older = bias_offset + 3 * m + i
-            newer = older + size
-            step = weight * (bias_b[m, i] - bias_a[m, i])
-            H[older, older] += weight
-            H[newer, newer] += weight
-            H[older, newer] -= weight
-            g[older] -= step
-            g[newer] += step
+            row = NODE_DIM * a.T.shape[0] + 3 * m + i
+            _add_step(normal, row, weight, b.bias[m, i] - a.bias[m, i])
 
 
-@njit(cache=True)
-def _segment_index(n, rate_offset, index):
-    """Rows of [delta_n, x_n, delta_n+1, x_n+1] in a column, x the part at `rate_offset`."""
+@kernel
+def _add_column(normal, column, prior, share, work):
+    """Add the factors of one column to its own equations; returns the squared error."""
+    squared = _add_space(normal, column, prior, share, work)
+    return squared + _add_base(normal, column, prior, share, work)
+
+
+@kernel
+def _add_space(normal, column, prior, share, work):
+    """Add rest strain, and strain and velocity along the segments; the squared error."""
+    e, J, index = np.empty(12), np.empty((12, 24)), np.empty(24, np.int64)
+    weights, s = np.empty(6), prior.s
+    squared = 0.0
+    for n in range(s.shape[0]):
+        for i in range(6):
+            off = column.strain[n, i] - prior.rest[i]
+            row = NODE_DIM * n + STRAIN + i
+            information = prior.rest_information[i] * share
+            normal.H[row, row] += information
+            normal.g[row] += information * off
+            squared += information * off * off
+        if n == s.shape[0] - 1:
+            break
+        bent = ends_along(column.T, column.strain, s, n)
+        gp.motion_error(bent, e, J, work)
+        rows_along(n, STRAIN, index)
+        squared += gp.add_motion(normal, index, e, J, bent.span, prior.inverse_strain_psd[n])
+        moved = ends_along(column.T, column.velocity, s, n)
+        gp.transport_error(moved, e[:6], J[:6], work)
+        rows_along(n, VELOCITY, index)
+        for i in range(6):
+            weights[i] = prior.inverse_velocity_psd[i] / moved.span
+        squared += add_rows(normal, index, e[:6], J[:6], weights)
+    return squared
+
+
+@kernel
+def _add_base(normal, column, prior, share, work):
+    """Add the base's pose and velocity; the squared error."""
+    at, velocity = work[0], column.velocity[0]
+    lie_kernels.pose_error(prior.T_map_base, column.T[0], at.xi, at.right, at.scratch)
+    error, J, squared = at.xi.x, at.right, 0.0
     for i in range(6):
-        index[i] = NODE_DIM * n + POSE + i
-        index[6 + i] = NODE_DIM * n + rate_offset + i
-        index[12 + i] = NODE_DIM * (n + 1) + POSE + i
-        index[18 + i] = NODE_DIM * (n + 1) + rate_offset + i
+        information = prior.base_information[0, i] * share
+        rate = prior.base_information[1, i] * share
+        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
+        for j in range(6):
+            weighted = information * J[i, j]
+            normal.g[j] += weighted * error[i]
+            for k in range(j, 6):
+                normal.H[j, k] += weighted * J[i, k]
+        normal.H[VELOCITY + i, VELOCITY + i] += rate
+        normal.g[VELOCITY + i] += rate * velocity[i]
+    return squared

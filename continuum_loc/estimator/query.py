@@ -11,9 +11,18 @@ from dataclasses import dataclass
 
 from continuum_loc import lie
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.output import body_between, BodyState
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE, STRAIN, VELOCITY
-from continuum_loc.estimator.window import TIME_EPSILON, Window
+from continuum_loc.estimator.interpolation import body_between, BodyState
+from continuum_loc.estimator.state import (
+    Column,
+    ends_in_time,
+    Grid,
+    NODE_DIM,
+    POSE,
+    STRAIN,
+    TIME_EPSILON,
+    VELOCITY,
+)
+from continuum_loc.estimator.window import Window
 import numpy as np
 
 SMOOTHED_BY = 2  # knots
@@ -124,9 +133,7 @@ def _between(window: Window, k: int, P: np.ndarray, time: float, n: int):
     J = np.zeros((2 * m, 4 * m))
     T, velocity = np.empty((2, 4, 4)), np.empty((2, 6))
     for i in range(2):
-        T[i], velocity[i], J_pose, J_rate = gp.interpolate(
-            a.T[n + i], a.velocity[n + i], b.T[n + i], b.velocity[n + i], d, tau
-        )
+        T[i], velocity[i], J_pose, J_rate = gp.interpolate(ends_in_time(a, b, n + i), tau)
         for rows, part in ((POSE, J_pose), (VELOCITY, J_rate)):
             for block, column in enumerate((POSE, VELOCITY, 2 * m + POSE, 2 * m + VELOCITY)):
                 J[_six(m * i + rows), _six(m * i + column)] = part[:, _six(6 * block)]
@@ -144,9 +151,7 @@ def _open_bridge(
 ) -> np.ndarray:
     """Covariance (36, 36) that two columns leave open of the two nodes between them."""
     d, tau = b.time - a.time, time - a.time
-    motion = np.empty((2, 2))
-    gp.bridge(tau, d, motion)
-    return _process_noise(window, n, jerked, motion, tau * (d - tau) / d)
+    return _process_noise(window, n, jerked, gp.bridge(tau, d), tau * (d - tau) / d)
 
 
 def _process_noise(
@@ -163,7 +168,7 @@ def _process_noise(
         at = start + np.concatenate([np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)])
         Q[np.ix_(at, at)] = np.kron(motion, np.diag(jerked[n + i] * psd[n + i]))
         at = start + np.arange(STRAIN, STRAIN + 6)
-        Q[at, at] = jerked[n + i] * strain / window.priors.strain_rate
+        Q[at, at] = jerked[n + i] * strain / window.priors.inverse_strain_rate_psd
     return Q
 
 
@@ -192,7 +197,9 @@ def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd
     adjoint carries from the nearer node.
     """
     ds, m = grid.s[n + 1] - grid.s[n], NODE_DIM
-    T_s, strain_s, J_pose, J_rate = gp.interpolate(T[0], strain[0], T[1], strain[1], ds, offset)
+    T_s, strain_s, J_pose, J_rate = gp.interpolate(
+        gp.Ends(T[0], strain[0], T[1], strain[1], ds), offset
+    )
     J = np.zeros((m, 2 * m))
     for rows, part in ((POSE, J_pose), (STRAIN, J_rate)):
         for block, column in enumerate((POSE, STRAIN, m + POSE, m + STRAIN)):
@@ -204,9 +211,7 @@ def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd
     ]
     J[_six(VELOCITY), _six(VELOCITY)], J[_six(VELOCITY), _six(m + VELOCITY)] = carried
     covariance = J @ P @ J.T
-    space = np.empty((2, 2))
-    gp.bridge(offset, ds, space)
-    covariance[:12, :12] += np.kron(space, np.diag(strain_psd))
+    covariance[:12, :12] += np.kron(gp.bridge(offset, ds), np.diag(strain_psd))
     return BodyState(
         T_s, strain_s, carried[0] @ velocity[0] + carried[1] @ velocity[1], covariance
     )

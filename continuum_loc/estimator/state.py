@@ -8,13 +8,15 @@ velocity 6], then the biases. Pose perturbations act on the right.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from continuum_loc import lie, lie_kernels
+from continuum_loc.compiling import kernel
+from continuum_loc.estimator import gp
 from continuum_loc.robot import RobotDescription
-from numba import njit
 import numpy as np
 
+TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
 NODE_DIM = 18
 STEP_LENGTH = 0.004  # [m] over which strain may step at a module's end
 POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
@@ -72,8 +74,7 @@ class Grid:
         return int(n[0]), float(offset[0])
 
 
-@dataclass(slots=True, eq=False)
-class Column:
+class Column(NamedTuple):
     """
     The body at one knot.
 
@@ -86,32 +87,16 @@ class Column:
     velocity: np.ndarray
     bias: np.ndarray
 
-    def copy(self) -> Column:
-        return Column(
-            self.time, self.T.copy(), self.strain.copy(), self.velocity.copy(), self.bias.copy()
-        )
-
     def retract(self, delta: np.ndarray) -> Column:
         """Move the column by a tangent vector (18 N + 3 I,)."""
-        moved = self.copy()
-        _retract(moved.T, moved.strain, moved.velocity, moved.bias, delta)
-        return moved
-
-    def minus(self, other: Column) -> np.ndarray:
-        """
-        Tangent vector from `other` to this column, the inverse of `retract`.
-
-        `other.retract(self.minus(other))` is self.
-        """
-        nodes = np.concatenate(
-            [
-                lie.log(lie.inverse(other.T) @ self.T),
-                self.strain - other.strain,
-                self.velocity - other.velocity,
-            ],
-            axis=1,
+        T, strain, velocity, bias = (
+            self.T.copy(),
+            self.strain.copy(),
+            self.velocity.copy(),
+            self.bias.copy(),
         )
-        return np.concatenate([nodes.ravel(), (self.bias - other.bias).ravel()])
+        _retract(T, strain, velocity, bias, delta)
+        return Column(self.time, T, strain, velocity, bias)
 
     def predict(self, dt: float) -> Column:
         """Predict the column dt later at constant body-frame velocity: the prior's mean."""
@@ -124,7 +109,7 @@ class Column:
         )
 
 
-@njit(cache=True)
+@kernel
 def _retract(T, strain, velocity, bias, delta):
     step, moved = np.empty((4, 4)), np.empty((4, 4))
     nodes = T.shape[0]
@@ -136,9 +121,41 @@ def _retract(T, strain, velocity, bias, delta):
         for i in range(6):
             strain[n, i] += delta[first + STRAIN + i]
             velocity[n, i] += delta[first + VELOCITY + i]
-    for b in range(bias.shape[0]):
+    for m in range(bias.shape[0]):
         for i in range(3):
-            bias[b, i] += delta[18 * nodes + 3 * b + i]
+            bias[m, i] += delta[NODE_DIM * nodes + 3 * m + i]
+
+
+@kernel
+def ends_in_time(a, b, n):
+    """Two states of node n, at the columns a and b, as the process in time connects them."""
+    return gp.Ends(a.T[n], a.velocity[n], b.T[n], b.velocity[n], b.time - a.time)
+
+
+@kernel
+def ends_along(T, rate, s, n):
+    """Nodes n and n + 1 at arclengths s (N,) with strain or velocity `rate` (N, 6)."""
+    return gp.Ends(T[n], rate[n], T[n + 1], rate[n + 1], s[n + 1] - s[n])
+
+
+@kernel
+def rows_in_time(n, dim, index):
+    """Rows (24,) of the `Ends` of `ends_in_time` in an interval's two columns of `dim`."""
+    for i in range(6):
+        index[i] = NODE_DIM * n + POSE + i
+        index[6 + i] = NODE_DIM * n + VELOCITY + i
+        index[12 + i] = dim + index[i]
+        index[18 + i] = dim + index[6 + i]
+
+
+@kernel
+def rows_along(n, part, index):
+    """Rows (24,) of the `Ends` of `ends_along` in a column; part: STRAIN or VELOCITY."""
+    for i in range(6):
+        index[i] = NODE_DIM * n + POSE + i
+        index[6 + i] = NODE_DIM * n + part + i
+        index[12 + i] = NODE_DIM + index[i]
+        index[18 + i] = NODE_DIM + index[6 + i]
 
 
 def shape_from_strain(T_map_base: np.ndarray, s: np.ndarray, strain: np.ndarray) -> np.ndarray:
@@ -155,12 +172,18 @@ def shape_from_strain(T_map_base: np.ndarray, s: np.ndarray, strain: np.ndarray)
     return T
 
 
-def column_at_rest(grid: Grid, T_map_base: np.ndarray, strain: np.ndarray, time: float) -> Column:
-    """Make a motionless column with the given strain (N, 6)."""
+def column_at_rest(
+    grid: Grid,
+    T_map_base: np.ndarray,
+    strain: np.ndarray,
+    time: float,
+    bias: np.ndarray | None = None,
+) -> Column:
+    """Make a motionless column with the given strain (N, 6), and gyro biases (I, 3) if not 0."""
     return Column(
         time,
         shape_from_strain(T_map_base, grid.s, strain),
         strain.copy(),
         np.zeros_like(strain),
-        np.zeros((grid.biases, 3)),
+        np.zeros((grid.biases, 3)) if bias is None else bias.copy(),
     )

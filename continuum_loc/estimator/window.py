@@ -13,42 +13,28 @@ oldest column is marginalised as the window moves on; the point at which that ha
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 
 from continuum_loc.errors import SingularError
-from continuum_loc.estimator.chain import Chain, half_square, Message
-from continuum_loc.estimator.factors import Factor
-from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.output import (
+from continuum_loc.estimator.chain import Chain
+from continuum_loc.estimator.interpolation import (
     blended_step,
     Body,
     body_between,
     motion_bridge,
     motion_jacobians,
 )
+from continuum_loc.estimator.interval import Interval
+from continuum_loc.estimator.normal import Normal
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE_PART
+from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE_PART, TIME_EPSILON
 import numpy as np
 
-TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
 DAMPING_LIMIT = 1e4
 # Relative: associations change between iterations, so costs compare only so well.
 COST_SLACK = 1e-3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """
-    How the window's measurements fit.
-
-    Squared normalised residuals, their number, and the share of fitting samples by sensor.
-    """
-
-    squared: float
-    count: int
-    shares: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +93,7 @@ class Window:
         changed = oldest.changed
         if changed:
             oldest.linearise(self.priors, self.columns[0], self.columns[1])
-        self.chain.forget_oldest(oldest.blocks, changed)
+        self.chain.forget_oldest(oldest.normal, changed)
         del self.columns[0], self.offsets[0], self.intervals[0]
         self.pinned = True
 
@@ -118,7 +104,7 @@ class Window:
         `moving` says that the body may be in motion there.
         """
         self._moving, self.pinned = moving, False
-        self.chain = Chain(self.grid.dim, self._start_message())
+        self.chain = Chain(self.grid.dim, self._start())
         self.mark_changed()
 
     def keep_newest(self, count: int) -> None:
@@ -155,12 +141,12 @@ class Window:
 
     def place(self, shape: Column) -> None:
         """Put the whole window motionless into one shape and forget the past."""
-        self.set_columns([replace(shape, time=old.time) for old in self.columns])
+        self.set_columns([shape._replace(time=old.time) for old in self.columns])
 
     def observe_bias(self, weight: np.ndarray, mean: np.ndarray) -> None:
         """Tell the first column its gyro biases (3 I,), each with a weight."""
         self._bias = weight, mean
-        self.chain.messages[0] = self._start_message()
+        self.chain.marginals[0] = self._start()
         self.intervals[0].changed = True
 
     def mark_changed(self) -> None:
@@ -168,14 +154,14 @@ class Window:
         for interval in self.intervals:
             interval.changed = True
 
-    def _start_message(self) -> Message:
-        message = self.priors.start(self.columns[0], self._moving)
+    def _start(self) -> Normal:
+        start = self.priors.start(self.columns[0], self._moving)
         if self._bias is not None:
             weight, mean = self._bias
             at = np.arange(self.grid.bias_offset, self.grid.dim)
-            message.information[at, at] += weight
-            message.gradient[at] += weight * (self.columns[0].bias.ravel() - mean)
-        return message
+            start.H[at, at] += weight
+            start.g[at] += weight * (self.columns[0].bias.ravel() - mean)
+        return start
 
     # ------------------------------------------------------------------ Gauss-Newton
 
@@ -233,7 +219,7 @@ class Window:
         return iteration, iteration < limit and damping <= DAMPING_LIMIT
 
     def _solve(self, first: int, damping: float) -> list[np.ndarray]:
-        return self.chain.solve([interval.blocks for interval in self.intervals], first, damping)
+        return self.chain.solve([interval.normal for interval in self.intervals], first, damping)
 
     def _linearise(self) -> int:
         """Linearise the intervals that changed; the first of them."""
@@ -254,7 +240,7 @@ class Window:
             self.columns[k] = self.columns[k].retract(offset)
             self.offsets[k] = np.zeros(self.grid.dim)
             if k == 0:
-                self.chain.messages[0] = self._start_message()
+                self.chain.marginals[0] = self._start()
             for touched in (k - 1, k):
                 if 0 <= touched < len(self.intervals):
                     self.intervals[touched].changed = True
@@ -268,7 +254,7 @@ class Window:
         for k, interval in enumerate(self.intervals):
             interval.changed = interval.changed or moved[k] or moved[k + 1]
         if moved[0]:
-            self.chain.messages[0] = self._start_message()
+            self.chain.marginals[0] = self._start()
 
     def _largest_move(self, offsets: list[np.ndarray], time: float | None = None) -> float:
         """Largest pose component [m, rad] of the step to these offsets, up to `time`."""
@@ -288,72 +274,14 @@ class Window:
 
     def _cost(self) -> float:
         """Robust cost where linearised, and by the quadratic model at the offsets."""
-        start, x = self.chain.messages[0], self.offsets[0]
-        total = float(start.gradient @ x) + half_square(start.information, x)
+        start, x = self.chain.marginals[0], self.offsets[0]
+        total = float(start.g @ x) + start.half_square(x)
         return total + sum(
             interval.modelled_cost(self.offsets[k], self.offsets[k + 1])
             for k, interval in enumerate(self.intervals)
         )
 
-    # ------------------------------------------------------------------ what it says
-
-    def fit(self, newest: int = 0) -> Fit:
-        """How the measurements in the window fit, or in its `newest` intervals."""
-        squared, count = 0.0, 0
-        samples: dict[str, np.ndarray] = {}
-        for interval in self.intervals[-newest:]:
-            for report in interval.reports.values():
-                squared += report.squared
-                count += report.count
-                for sensor, fit in report.fits.items():
-                    samples[sensor] = samples.get(sensor, 0.0) + fit
-        return Fit(
-            squared,
-            count,
-            {name: float(fit[1] / fit[0]) for name, fit in samples.items() if fit[0] > 0},
-        )
-
-    def measurement_cost(self) -> float:
-        """Robust cost of the measurements alone, without the priors."""
-        return sum(
-            report.cost for interval in self.intervals for report in interval.reports.values()
-        )
-
-    def newest_fits(self, factor_name: str) -> dict[str, np.ndarray]:
-        """[usable, fitting] samples by sensor, in the newest interval that has this factor."""
-        for interval in reversed(self.intervals):
-            if factor_name in interval.reports:
-                return interval.reports[factor_name].fits
-        return {}
-
-    def newest_rows(self, factor: Factor, count: int) -> list[tuple]:
-        """Rows of a factor in the newest `count` intervals, in order of arrival."""
-        return [row for interval in self.intervals[-count:] for row in interval.rows(factor)]
-
-    def flicker(self) -> dict[str, float]:
-        """Share of each ToF sensor's zones that the map matched in one of two frames in a row."""
-        counts: dict[str, np.ndarray] = {}
-        for interval in self.intervals:
-            if 'tof' in interval.reports:
-                for name, count in interval.reports['tof'].flicker.items():
-                    counts[name] = counts.get(name, 0.0) + count
-        return {name: float(changed / seen) for name, (seen, changed) in counts.items()}
-
-    def rattle(self, time: float) -> dict[str, np.ndarray]:
-        """
-        Variance (3,) by gyro of the turns that are too fast for the knots, about `time` [rad^2].
-
-        The larger of the interval's that holds `time` and the one before: the newest may have
-        just begun.
-        """
-        k = self.knot_before(time)
-        found: dict[str, np.ndarray] = {}
-        newest = slice(max(k - 1, 0), k + 1)
-        for interval in self.intervals[newest]:
-            if 'gyro' in interval.reports:
-                for name, variance in interval.reports['gyro'].rattle.items():
-                    found[name] = np.maximum(found.get(name, 0.0), variance)
-        return found
+    # ------------------------------------------------------------------ the body in it
 
     def knot_before(self, time: float) -> int:
         """Return the interval that holds `time`, clipped to the window."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
+from continuum_loc.mapping.grid import spatial_order
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import spatial_order
-from numba import njit
 import numpy as np
 
 NEIGHBOURS = 20  # of a PCA neighbourhood
@@ -26,17 +26,19 @@ def sample_mesh(
     region: tuple[np.ndarray, np.ndarray] | None = None,
     sigma: float = 1e-4,
     source: str = 'mesh',
+    notes: tuple[str, ...] = (),
 ) -> PriorMap:
     """
     Blue-noise points on a triangle mesh with the triangles' normals.
 
-    Normals point outward by the right-hand rule.
+    Normals point outward by the right-hand rule. Raises MapError for a mesh without area.
 
     vertices: (V, 3) [m]; faces: (F, 3). No two points on the same side of the surface are closer
     than `spacing` [m]; or give `count`, about as many points as wanted. The two sides of a thin
     part are sampled independently, and normals are the triangles' own: PCA mixes the sides of a
     thin blade up.
-    region: (lower, upper) corners of a box [m] to which the map is confined.
+    region: (lower, upper) corners of a box [m] to which the map is confined. source, notes: of
+    the map.
     """
     vertices, faces = _checked_mesh(vertices, faces, source)
     areas, normals = _triangle_areas_and_normals(vertices, faces)
@@ -59,7 +61,14 @@ def sample_mesh(
     points, normals = points[order], normals[triangle[order]]
     planarity, _ = local_shape(points, normals)
     return PriorMap(
-        points, normals, planarity, sigma=sigma, spacing=spacing, source=source, seed=seed
+        points,
+        normals,
+        planarity,
+        sigma=sigma,
+        spacing=spacing,
+        source=source,
+        seed=seed,
+        notes=notes,
     )
 
 
@@ -71,14 +80,14 @@ def map_from_cloud(
     viewpoint: np.ndarray | None = None,
     sigma: float = 1e-4,
     source: str = 'cloud',
+    notes: tuple[str, ...] = (),
 ) -> PriorMap:
     """
     Make a map from a measured cloud (P, 3) [m].
 
-    What is missing of normals (P, 3) and planarity (P,) comes from PCA.
-
-    PCA normals are turned toward `viewpoint` (3,) [m]; without one their sign means nothing and
-    the map says so.
+    What is missing of normals (P, 3) and planarity (P,) comes from PCA. PCA normals are turned
+    toward `viewpoint` (3,) [m]; without one their sign means nothing and the map says so. source,
+    notes: of the map.
     """
     points = _finite(points, 'points', source)
     oriented = normals is not None or viewpoint is not None
@@ -96,6 +105,7 @@ def map_from_cloud(
         spacing=_typical_spacing(points),
         oriented=oriented,
         source=source,
+        notes=notes,
     )
 
 
@@ -253,7 +263,7 @@ def _poisson_subset(points, normals, spacing):
     return np.flatnonzero(_throw_darts(points, normals, cells, spacing, slots, following))
 
 
-@njit(cache=True)
+@kernel
 def _throw_darts(points, normals, cells, spacing, slots, following):
     """
     Accept each point unless an accepted one of its side lies within `spacing`.
@@ -285,7 +295,7 @@ def _throw_darts(points, normals, cells, spacing, slots, following):
     return accepted
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _cell_row(i, j, k, mask):
     mixed = (
         (np.uint64(i) * np.uint64(73856093))
@@ -295,7 +305,7 @@ def _cell_row(i, j, k, mask):
     return np.int64(((mixed * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(24)) & np.uint64(mask))
 
 
-@njit(cache=True, inline='always')
+@kernel(inline='always')
 def _crowds(points, normals, p, other, spacing):
     dx = points[p, 0] - points[other, 0]
     dy = points[p, 1] - points[other, 1]

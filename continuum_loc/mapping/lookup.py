@@ -1,260 +1,202 @@
 """
-The lookups of `VoxelIndex`, as kernels that others can call.
+The lookup of `VoxelIndex`, as a kernel that other kernels call.
 
-A batch goes through four passes: where each query's list lies, its two nearest points in single
-precision, which one it is in double precision, and a search of the grid for the rest. Arrays are
-handed on once a batch: numba counts who holds them, which for each query would take longer than
-the lookup.
+Blocks around a place are looked at in rings, each a hollow cube of blocks, from the block that
+holds the place outward. The search ends when what has been found is nearer than any block that was
+not looked at. Comparisons that may rule a block out give way by ROUNDING, so that rounding never
+rules a neighbour out.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from continuum_loc.mapping.candidates import find_near_lists
-from continuum_loc.mapping.facing import find_facing_lists, forget_lists
-from continuum_loc.mapping.grid import distance2, in_range, Lattice, search, toward
-from continuum_loc.mapping.lanes import (
-    COS_ERROR,
-    facing_lanes,
-    fetch,
-    LANES,
-    lowest_lane,
-    near_lanes,
-    slack2,
-    two_nearest,
-    two_nearest_facing,
-)
-from numba import njit
+from continuum_loc.compiling import kernel
+from continuum_loc.mapping.grid import find
 import numpy as np
+
+ROUNDING = 1e-9  # far above the rounding of coordinates counted in blocks
+
+
+class Lattice(NamedTuple):
+    """Corner x, y, z [m] that blocks are counted from, edge of one [m], blocks along each axis."""
+
+    corner: tuple[float, float, float]
+    edge: float
+    inverse_edge: float
+    extent: tuple[int, int, int]
 
 
 class VoxelArrays(NamedTuple):
     """
-    The index as arrays.
+    A cloud sorted by block; kernels take it whole, and none writes to it.
 
-    Kernels take it whole and unpack it outside their loops. Only the last eight arrays are ever
-    written.
-
-    points: (16 G, 4) x, y, z [m] and the row in the caller's cloud, sorted by block; the last
-        group is filled up with points at infinity. normals: (16 G, 3).
-    lanes, faces: (G, 3, 16) points, from the lattice's corner, and normals in groups.
-    block_slots: (H, 2) hash table from a block's key to its span of sorted points.
-    block_spans: (B,) all of them; block_at: (B, 3) each block's place, in blocks.
-    reach: distance [m] up to which lists are made.
-    cell_slots: (C + COUNTERS, 2) hash table from a cell's and cone's key to their packed list
-        (start * 2^16 + length), to minus the number of visits so far, or to CROWDED.
-    list_lanes, list_faces: (L, 3, 16) packed groups of the lists, end to end.
-    list_points: (L, 16) their points' rows of `points`.
-    scratch, scratch_gap2: (B,) spans of the blocks that a search is about to look at, and their
-        squared distances in blocks.
-    marks: (G,) the last list for which a group was looked at.
-    made_for: (1,) the `min_cos` that the lists are kept for; another empties the cache.
+    points, normals: (P, 3) [m], unit; rows: (P,) the points' rows in the caller's cloud.
+    begins: (B + 1,) where the points of each block begin; they end where the next one's begin.
+    places: (B, 3) of the blocks, counted from the lattice's corner; slots: their hash table.
     """
 
     points: np.ndarray
     normals: np.ndarray
-    lanes: np.ndarray
-    faces: np.ndarray
-    block_slots: np.ndarray
-    block_spans: np.ndarray
-    block_at: np.ndarray
+    rows: np.ndarray
+    begins: np.ndarray
+    places: np.ndarray
+    slots: np.ndarray
     lattice: Lattice
-    reach: float
-    cell_slots: np.ndarray
-    list_lanes: np.ndarray
-    list_faces: np.ndarray
-    list_points: np.ndarray
-    scratch: np.ndarray
-    scratch_gap2: np.ndarray
-    marks: np.ndarray
-    made_for: np.ndarray
 
 
-@njit(cache=True)
-def nearest_batch(arrays, near, queries, max_distance, index, gap2):
+class Beam(NamedTuple):
+    """End of a beam [m], its unit direction, and the least cosine of a surface that faces it."""
+
+    x: float
+    y: float
+    z: float
+    dx: float
+    dy: float
+    dz: float
+    min_cosine: float
+
+
+@kernel
+def nearest_facing_batch(arrays, ends, directions, max_distance, min_cosine, found, distance2):
     """
-    Find the nearest points to queries (Q, 3): their rows index (Q,) and gap2 (Q,) [m^2].
+    Find for each beam the nearest point to its end among those whose normals face it.
 
-    The rows are the caller's; -1 and inf where none lies strictly within `max_distance` [m] or a
-    query is not finite. near: `NearCells`.
+    A normal n faces the direction d where -(n . d) >= min_cosine. ends, directions: (Q, 3), the
+    latter unit, away from the sensor. Writes the rows in the caller's cloud to found (Q,) and the
+    squared distances to distance2 (Q,) [m^2]: -1 and inf where none lies strictly within
+    `max_distance` [m], or an end is not finite. Of equally near points the first of the caller's
+    cloud is taken.
     """
-    count = len(queries)
-    first, after = np.empty(count, np.int64), np.empty(count, np.int64)
-    found = np.empty(count, np.int64), np.empty(count, np.float32), np.empty(count, np.float32)
-    find_near_lists(near, queries, first, after)
-    _compare(arrays, near.groups, queries, first, after, *found)
-    _settle(arrays, near.groups, queries, max_distance, first, after, *found, index, gap2)
-    _search_rest(arrays, queries, queries, max_distance, -1.0, first, index, gap2)
-
-
-@njit(cache=True)
-def nearest_facing_batch(arrays, queries, directions, max_distance, min_cos, index, gap2):
-    """
-    As `nearest_batch`, among the points whose outward normal n has -(n . d) >= min_cos.
-
-    directions: (Q, 3) unit vectors d along the beams, so that each hits the surface from outside.
-    """
-    if arrays.made_for[0] != min_cos:
-        forget_lists(arrays.cell_slots)
-        arrays.made_for[0] = min_cos
-    count = len(queries)
-    first, after = np.empty(count, np.int64), np.empty(count, np.int64)
-    found = np.empty(count, np.int64), np.empty(count, np.float32), np.empty(count, np.float32)
-    begin = 0
-    while begin < count:
-        end = find_facing_lists(arrays, queries, directions, min_cos, begin, first, after)
-        _compare_facing(arrays, queries, directions, min_cos, begin, end, first, after, *found)
-        _settle_facing(
-            arrays, queries, directions, max_distance, min_cos, begin, end, first, after, *found,
-            index, gap2,
+    limit2 = max_distance * max_distance
+    for q in range(ends.shape[0]):
+        beam = Beam(
+            ends[q, 0], ends[q, 1], ends[q, 2],
+            directions[q, 0], directions[q, 1], directions[q, 2], min_cosine,
         )  # fmt: skip
-        begin = end
-    _search_rest(arrays, queries, directions, max_distance, min_cos, first, index, gap2)
+        row, best2 = _search(arrays, beam, limit2)
+        found[q], distance2[q] = row, best2 if row >= 0 else np.inf
 
 
-@njit(cache=True)
-def _compare(arrays, groups, queries, first, after, nearest, least2, next2):
-    """Find the two nearest to each query in its list, groups[first:after], in single precision."""
-    lanes, lattice = arrays.lanes, arrays.lattice
-    x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
-    for q in range(queries.shape[0]):
-        nearest[q], least2[q], next2[q] = two_nearest(
-            lanes, groups, first[q], after[q],
-            np.float32(queries[q, 0] - x0), np.float32(queries[q, 1] - y0),
-            np.float32(queries[q, 2] - z0),
-        )  # fmt: skip
+@kernel
+def _search(arrays, beam, limit2):
+    """Row of the nearest point that faces the beam, or -1, and its squared distance [m^2]."""
+    lattice, row, best2 = arrays.lattice, np.int64(-1), limit2
+    if not (np.isfinite(beam.x) and np.isfinite(beam.y) and np.isfinite(beam.z)):
+        return row, best2
+    at = (
+        (beam.x - lattice.corner[0]) * lattice.inverse_edge,
+        (beam.y - lattice.corner[1]) * lattice.inverse_edge,
+        (beam.z - lattice.corner[2]) * lattice.inverse_edge,
+    )
+    home = (
+        _within(at[0], lattice.extent[0]),
+        _within(at[1], lattice.extent[1]),
+        _within(at[2], lattice.extent[2]),
+    )
+    ring = 0
+    while (2 * ring + 1) ** 3 <= arrays.places.shape[0]:  # rings so far, hollow ones filled
+        row, best2 = _scan_ring(arrays, beam, at, home, ring, row, best2)
+        if _cleared(lattice, at, home, ring) ** 2 > _reach2(lattice, best2):
+            return row, best2
+        ring += 1
+    return _scan_all(arrays, beam, at, row, best2)
 
 
-@njit(cache=True)
-def _settle(
-    arrays, groups, queries, max_distance, first, after, nearest, least2, next2, index, gap2
-):
+# at: place of a beam's end counted in blocks; home: the block that holds it, or the nearest to it.
+
+
+@kernel(inline='always')
+def _within(u, count):
+    """Nearest of `count` blocks along one axis."""
+    return int(min(max(np.floor(u), 0.0), count - 1.0))
+
+
+@kernel(inline='always')
+def _reach2(lattice, distance2):
+    """Squared distance in blocks within which a block may hold a point as near as this [m^2]."""
+    return distance2 * lattice.inverse_edge * lattice.inverse_edge * (1.0 + ROUNDING) + ROUNDING
+
+
+@kernel(inline='always')
+def _gap2(u, place):
+    """Squared distance along one axis, in blocks, to the block at this place."""
+    gap = max(place - u, u - place - 1.0, 0.0)
+    return gap * gap
+
+
+@kernel(inline='always')
+def _cleared(lattice, at, home, ring):
+    """How far from the place, in blocks, no block is left to look at beyond a ring."""
+    nearest = np.inf
+    for axis in range(3):
+        if home[axis] - ring > 0:
+            nearest = min(nearest, at[axis] - (home[axis] - ring))
+        if home[axis] + ring + 1 < lattice.extent[axis]:
+            nearest = min(nearest, home[axis] + ring + 1 - at[axis])
+    return nearest
+
+
+@kernel(inline='always')
+def _outward(u, home, n):
+    """Take the n-th place along an axis from home outward, the nearer side of u first."""
+    away = (n + 1) // 2
+    return home + away if (n % 2 == 1) == (u - home > 0.5) else home - away
+
+
+@kernel(inline='always')
+def _scan_ring(arrays, beam, at, home, ring, row, best2):
     """
-    Decide in double precision which point is nearest, and whether it is near enough.
+    Improve (row, squared distance) by the blocks of a ring that come into question.
 
-    Nearly always no other one comes into question.
+    Each axis is walked outward, so that what is found early rules most others out.
     """
-    lanes, points, lattice = arrays.lanes, arrays.points, arrays.lattice
-    x0, y0, z0, rounding = lattice.x0, lattice.y0, lattice.z0, lattice.rounding
-    for q in range(queries.shape[0]):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        best2, row = max_distance * max_distance, -1.0
-        within2 = np.float32(least2[q] + 2.0 * slack2(least2[q], rounding))
-        if next2[q] > within2:
-            p = nearest[q]
-            d2 = distance2(points, p, x, y, z)
-            if d2 < best2:
-                best2, row = d2, points[p, 3]
-        elif least2[q] < np.inf:
-            sx, sy, sz = np.float32(x - x0), np.float32(y - y0), np.float32(z - z0)
-            for c in range(first[q], after[q]):
-                group = np.int64(groups[c])
-                chosen = near_lanes(lanes, group, sx, sy, sz, within2)
-                while chosen != 0:
-                    p = LANES * group + lowest_lane(chosen)
-                    chosen &= chosen - 1
-                    d2 = distance2(points, p, x, y, z)
-                    if d2 < best2 or (d2 == best2 and points[p, 3] < row):
-                        best2, row = d2, points[p, 3]
-        index[q], gap2[q] = np.int64(row), best2 if row >= 0.0 else np.inf
-
-
-@njit(cache=True)
-def _compare_facing(
-    arrays, queries, directions, min_cos, begin, end, first, after, nearest, least2, next2
-):
-    """
-    As `_compare`, for queries begin..end, among the points of their lists that may face.
-
-    nearest holds rows of `points`; ~row where single precision cannot tell that it faces the beam.
-    """
-    lanes, faces, listed = arrays.list_lanes, arrays.list_faces, arrays.list_points
-    points, lattice = arrays.points, arrays.lattice
-    x0, y0, z0 = lattice.x0, lattice.y0, lattice.z0
-    may, sure = np.float32(min_cos - COS_ERROR), np.float32(min_cos + COS_ERROR)
-    for q in range(begin, end):
-        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
-        bx, by, bz = np.float32(dx), np.float32(dy), np.float32(dz)
-        found, least2[q], next2[q] = two_nearest_facing(
-            lanes, None, first[q], after[q],
-            np.float32(queries[q, 0] - x0), np.float32(queries[q, 1] - y0),
-            np.float32(queries[q, 2] - z0), faces, bx, by, bz, may,
-        )  # fmt: skip
-        group, lane = found // LANES, found % LANES
-        row = np.int64(listed[group, lane])
-        fetch(points, 4 * row)
-        facing = -(
-            faces[group, 0, lane] * bx + faces[group, 1, lane] * by + faces[group, 2, lane] * bz
-        )
-        nearest[q] = row if facing >= sure else ~row
-
-
-@njit(cache=True)
-def _settle_facing(
-    arrays, queries, directions, max_distance, min_cos, begin, end, first, after,
-    nearest, least2, next2, index, gap2,
-):  # fmt: skip
-    """
-    As `_settle`, for queries begin..end, among those that face the beam.
-
-    Sets `first` to -1 where that does not settle it: a point that all but faces the beam is nearer
-    than one that does.
-    """
-    lanes, faces, listed = arrays.list_lanes, arrays.list_faces, arrays.list_points
-    points, normals, lattice = arrays.points, arrays.normals, arrays.lattice
-    x0, y0, z0, rounding = lattice.x0, lattice.y0, lattice.z0, lattice.rounding
-    may = np.float32(min_cos - COS_ERROR)
-    for q in range(begin, end):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
-        best2, row, slack = max_distance * max_distance, -1.0, slack2(least2[q], rounding)
-        within2, settled = np.float32(least2[q] + 2.0 * slack), least2[q] == np.inf
-        if next2[q] > within2:
-            p = nearest[q] if nearest[q] >= 0 else ~nearest[q]
-            if p == nearest[q] or toward(normals, p, dx, dy, dz) >= min_cos:
-                settled, d2 = True, distance2(points, p, x, y, z)
-                if d2 < best2:
-                    best2, row = d2, points[p, 3]
-        if not settled:
-            sx, sy, sz = np.float32(x - x0), np.float32(y - y0), np.float32(z - z0)
-            bx, by, bz = np.float32(dx), np.float32(dy), np.float32(dz)
-            for group in range(first[q], after[q]):
-                chosen = near_lanes(lanes, group, sx, sy, sz, within2)
-                chosen &= facing_lanes(faces, group, bx, by, bz, may)
-                while chosen != 0:
-                    p = np.int64(listed[group, lowest_lane(chosen)])
-                    chosen &= chosen - 1
-                    d2 = distance2(points, p, x, y, z)
-                    if d2 < best2 or (d2 == best2 and points[p, 3] < row):
-                        if toward(normals, p, dx, dy, dz) >= min_cos:
-                            best2, row = d2, points[p, 3]
-            if best2 > least2[q] + slack:
-                first[q] = -1
-        index[q], gap2[q] = np.int64(row), best2 if row >= 0.0 else np.inf
-
-
-@njit(cache=True)
-def _search_rest(arrays, queries, directions, max_distance, min_cos, first, index, gap2):
-    """
-    Search the grid where there is no list (first: -1) or it does not know.
-
-    A list knows all that lies within reach, and nothing about what lies beyond.
-    """
-    points, normals, block_slots = arrays.points, arrays.normals, arrays.block_slots
-    spans, block_at, lattice = arrays.block_spans, arrays.block_at, arrays.lattice
-    scratch, gaps2, reach = arrays.scratch, arrays.scratch_gap2, arrays.reach
-    far, limit2 = max_distance > reach, max_distance * max_distance
-    for q in range(queries.shape[0]):
-        if first[q] >= 0 and not (far and (index[q] < 0 or gap2[q] > reach * reach)):
+    lattice, begins, slots = arrays.lattice, arrays.begins, arrays.slots
+    nx, ny, nz = lattice.extent
+    count, reach2 = 2 * ring + 1, _reach2(lattice, best2)
+    for a in range(count):
+        i = _outward(at[0], home[0], a)
+        gap_i = _gap2(at[0], i)
+        if gap_i > reach2 or not 0 <= i < nx:
             continue
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
-        if not in_range(lattice, x, y, z):
-            continue
-        best, best2, row = search(
-            points, normals, block_slots, spans, block_at, lattice, scratch, gaps2,
-            x, y, z, dx, dy, dz, min_cos, limit2,
-        )  # fmt: skip
-        if best >= 0:
-            index[q], gap2[q] = np.int64(row), best2
+        for b in range(count):
+            j = _outward(at[1], home[1], b)
+            gap_ij = gap_i + _gap2(at[1], j)
+            if gap_ij > reach2 or not 0 <= j < ny:
+                continue
+            # A ring is hollow: inside it a line of blocks has its two ends only.
+            for c in range(count - 2 if max(a, b) < count - 2 else 0, count):
+                k = _outward(at[2], home[2], c)
+                if 0 <= k < nz and gap_ij + _gap2(at[2], k) <= reach2:
+                    block = find(slots, i, j, k)
+                    if block >= 0:
+                        row, best2 = _scan(
+                            arrays, beam, begins[block], begins[block + 1], row, best2
+                        )
+                        reach2 = _reach2(lattice, best2)
+    return row, best2
+
+
+@kernel(inline='always')
+def _scan_all(arrays, beam, at, row, best2):
+    """Improve (row, squared distance) by all blocks: there are fewer than places in the rings."""
+    begins, places = arrays.begins, arrays.places
+    for block in range(places.shape[0]):
+        gap2 = _gap2(at[0], places[block, 0]) + _gap2(at[1], places[block, 1])
+        if gap2 + _gap2(at[2], places[block, 2]) <= _reach2(arrays.lattice, best2):
+            row, best2 = _scan(arrays, beam, begins[block], begins[block + 1], row, best2)
+    return row, best2
+
+
+@kernel(inline='always')
+def _scan(arrays, beam, first, after, row, best2):
+    """Improve (row, squared distance) by the sorted points first .. after that face the beam."""
+    points, normals, rows = arrays.points, arrays.normals, arrays.rows
+    for p in range(first, after):
+        ex, ey, ez = points[p, 0] - beam.x, points[p, 1] - beam.y, points[p, 2] - beam.z
+        gap2 = ex * ex + ey * ey + ez * ez
+        if gap2 < best2 or (gap2 == best2 and rows[p] < row):
+            along = normals[p, 0] * beam.dx + normals[p, 1] * beam.dy + normals[p, 2] * beam.dz
+            if -along >= beam.min_cosine:
+                row, best2 = rows[p], gap2
+    return row, best2

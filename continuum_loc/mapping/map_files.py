@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 import json
 from pathlib import Path
-import warnings
+from typing import Any
 
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.build import map_from_cloud, sample_mesh
-from continuum_loc.mapping.prior_map import by_suffix, CLOUD_COLUMNS, NPZ_FORMAT, PriorMap
+from continuum_loc.mapping.formats.content import bytes_of
+from continuum_loc.mapping.formats.obj import read_obj
+from continuum_loc.mapping.formats.pcd import read_pcd
+from continuum_loc.mapping.formats.ply import read_ply
+from continuum_loc.mapping.formats.shapes import Cloud, Mesh
+from continuum_loc.mapping.formats.stl import read_stl
+from continuum_loc.mapping.formats.text import read_pts, read_text
+from continuum_loc.mapping.prior_map import NPZ_FORMAT, PriorMap
+from continuum_loc.npz_files import NotAnArchive, read_arrays
 import numpy as np
 
-COLUMN_COUNTS = (3, 6, 7)
+MESH_POINTS = 300_000
+_ARRAYS = ('points', 'normals', 'planarity')
+_ABOUT: dict[str, tuple[type, ...]] = {
+    'sigma': (float, int),
+    'spacing': (float, int),
+    'oriented': (bool,),
+    'source': (str,),
+    'seed': (int, type(None)),
+    'notes': (list,),
+}
 
 
 def load_map(
@@ -22,187 +39,120 @@ def load_map(
     spacing: float | None = None,
     viewpoint: np.ndarray | None = None,
     seed: int = 0,
+    scale: float = 1.0,
 ) -> PriorMap:
     """
     Load a prior map from a file.
 
-    `.npz`, `.ply`, `.pcd`, `.xyz`, `.csv`, or a mesh (`.stl`, `.obj`, `.ply` with faces).
+    `.npz`, a cloud (`.ply`, `.pcd`, `.xyz`, `.txt`, `.asc`, `.csv`, `.pts`) or a mesh (`.stl`,
+    `.obj`, `.ply` with faces); all but `.npz` also with `.gz` after it.
 
-    sigma: standard deviation of a point [m], where the file states none (default 0.1 mm, the
-    paper's scanner).
+    sigma: standard deviation of a point [m]; by default what the file states, else 0.1 mm, the
+    paper's scanner.
     spacing: of the points sampled from a mesh [m] (default: about 300,000 points); seed: of that
     sampling.
     viewpoint: (3,) a place [m] that the surface is seen from, toward which the normals of a cloud
         that has none are turned. Without it they keep either sign and the map is not `oriented`.
-    Raises MapError naming the file, the line and what is valid. Nothing is ever dropped.
+    scale: what the file's lengths are multiplied by to be metres: 0.001 for millimetres. A stated
+        sigma of the map is a length too.
+    What was left out of the map, or aside, is in its `notes`. Raises MapError naming the file, the
+    place and what is valid.
     """
     path = Path(path)
-    reader = by_suffix(path, _READERS, 'read')
-    if not path.is_file():
-        raise MapError(f'{path}: there is no such file')
-    prior = reader(path, spacing, viewpoint, seed)
-    return replace(prior, source=str(path), sigma=prior.sigma if sigma is None else sigma)
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise MapError(f'{path}: scale must be > 0, got {scale}')
+    if path.suffix.lower() == '.npz':
+        return _own(path, scale, sigma)
+    shape = read_shape(path)
+    stated = {} if sigma is None else {'sigma': sigma}
+    where = {'source': str(path), 'notes': _scaled(scale, shape.notes)}
+    if isinstance(shape, Cloud):
+        return map_from_cloud(
+            shape.points * scale,
+            shape.normals,
+            shape.planarity,
+            viewpoint=viewpoint,
+            **where,
+            **stated,
+        )
+    density = {'count': MESH_POINTS} if spacing is None else {'spacing': spacing}
+    return sample_mesh(
+        shape.vertices * scale, shape.faces, seed=seed, **density, **where, **stated
+    )
+
+
+def read_shape(path: Path) -> Cloud | Mesh:
+    """
+    Read a cloud or a mesh as the file has it, in its units.
+
+    Raises MapError naming the file, the place and what is valid.
+    """
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    suffix = suffixes[-1] if suffixes else ''
+    if suffix == '.gz':
+        suffix = suffixes[-2] if len(suffixes) > 1 else ''
+    if suffix not in READERS:
+        raise MapError(
+            f"{path}: a map cannot be read as '{suffix}'; valid are .npz, {', '.join(READERS)}"
+        )
+    try:
+        return READERS[suffix](bytes_of(path), str(path))
+    except MemoryError:
+        raise MapError(f'{path}: does not fit into memory') from None
+
+
+READERS: dict[str, Callable[[bytes, str], Cloud | Mesh]] = {
+    '.ply': read_ply,
+    '.pcd': read_pcd,
+    '.xyz': read_text,
+    '.txt': read_text,
+    '.asc': read_text,
+    '.csv': read_text,
+    '.pts': read_pts,
+    '.stl': read_stl,
+    '.obj': read_obj,
+}
+
+
+def _scaled(scale: float, notes: tuple[str, ...]) -> tuple[str, ...]:
+    return notes if scale == 1.0 else (*notes, f'lengths multiplied by {scale:g}')
 
 
 # Own format
 
 
-def _read_npz(path: Path, spacing, viewpoint, seed) -> PriorMap:
+def _own(path: Path, scale: float, sigma: float | None) -> PriorMap:
+    if not path.is_file():
+        bytes_of(path)  # says what it is instead
     try:
-        with np.load(path, allow_pickle=False) as data:
-            if str(data['format']) != NPZ_FORMAT:
-                raise MapError(f"{path}: format '{data['format']}', expected '{NPZ_FORMAT}'")
-            return PriorMap(
-                data['points'],
-                data['normals'],
-                data['planarity'],
-                **json.loads(str(data['about'])),
-            )
-    except (KeyError, ValueError, OSError, TypeError) as error:
+        arrays = read_arrays(path)
+        if str(arrays.get('format')) != NPZ_FORMAT:
+            raise MapError(f"{path}: format '{arrays.get('format')}', expected '{NPZ_FORMAT}'")
+        about = _about(str(arrays['about']))
+        if scale != 1.0:
+            about['notes'] = _scaled(scale, about['notes'])
+            about |= {name: scale * about[name] for name in ('sigma', 'spacing')}
+            arrays['points'] = arrays['points'] * scale
+        about |= {'source': str(path)} | ({} if sigma is None else {'sigma': sigma})
+        return PriorMap(*(_numbers(arrays, name) for name in _ARRAYS), **about)
+    except (NotAnArchive, KeyError, TypeError, ValueError, RecursionError) as error:
         if isinstance(error, MapError):
             raise
         raise MapError(f'{path}: not a map written by PriorMap.save ({error})') from None
 
 
-# Tables of text
+def _about(text: str) -> dict[str, Any]:
+    """Check what is said about a map: known names, of their types."""
+    about = {'sigma': 1e-4, 'spacing': 0.0, 'notes': []} | json.loads(text)
+    for name, value in about.items():
+        if name not in _ABOUT or type(value) not in _ABOUT[name]:
+            raise ValueError(f'{name}: {value!r}')
+    if not all(isinstance(note, str) for note in about['notes']):
+        raise ValueError(f'notes: {about["notes"]!r}')
+    return about | {'notes': tuple(about['notes'])}
 
 
-def _read_text(path: Path, spacing, viewpoint, seed) -> PriorMap:
-    comma = path.suffix.lower() == '.csv'
-    skipped = 0
-    if comma:
-        skipped = _check_csv_header(path)
-    try:
-        with warnings.catch_warnings(
-            action='ignore', category=UserWarning
-        ):  # of an empty file, which is refused below
-            table = np.loadtxt(
-                path, delimiter=',' if comma else None, skiprows=skipped, ndmin=2, comments='#'
-            )
-    except (ValueError, UnicodeDecodeError) as error:
-        raise MapError(f'{path}: {_first_bad_line(path, skipped, comma) or error}') from None
-    if table.size == 0:
-        raise MapError(f'{path}: holds no points')
-    if table.shape[1] not in COLUMN_COUNTS:
-        raise MapError(f'{path}: {table.shape[1]} columns; valid are {_valid_columns()}')
-    return _from_table(path, table, viewpoint)
-
-
-def _valid_columns() -> str:
-    return ' or '.join(','.join(CLOUD_COLUMNS[:count]) for count in COLUMN_COUNTS)
-
-
-def _check_csv_header(path: Path) -> int:
-    """
-    Count header lines (0 or 1).
-
-    A header must name the columns in order.
-    """
-    with path.open(errors='replace') as stream:
-        names = [name.strip().lower() for name in stream.readline().split(',')]
-    if tuple(names) in {CLOUD_COLUMNS[:count] for count in COLUMN_COUNTS}:
-        return 1
-    try:
-        [float(name) for name in names]
-    except ValueError:
-        raise MapError(
-            f'{path}, line 1: columns {",".join(names)}; valid are {_valid_columns()}'
-        ) from None
-    return 0
-
-
-def _first_bad_line(path: Path, skipped: int, comma: bool) -> str | None:
-    """
-    Which line of a table cannot be used, and how many are like it.
-
-    Only read after a failure.
-    """
-    width, first, count = None, None, 0
-    with path.open(errors='replace') as stream:
-        for number, line in enumerate(stream, start=1):
-            fields = line.split('#')[0].strip()
-            fields = fields.split(',') if comma and fields else fields.split()
-            if number <= skipped or not fields:
-                continue
-            width = width or len(fields)
-            if len(fields) == width and all(_is_number(field) for field in fields):
-                continue
-            count += 1
-            first = first or f"line {number}: expected {width} numbers, got '{line.strip()[:80]}'"
-    return first and f'{first} ({count} such lines)'
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _from_table(path: Path, table: np.ndarray, viewpoint) -> PriorMap:
-    normals = table[:, 3:6] if table.shape[1] >= 6 else None
-    planarity = table[:, 6] if table.shape[1] >= 7 else None
-    return map_from_cloud(table[:, :3], normals, planarity, viewpoint=viewpoint, source=str(path))
-
-
-# Clouds and meshes read by libraries
-
-
-def _read_ply(path: Path, spacing, viewpoint, seed) -> PriorMap:
-    with path.open('rb') as stream:
-        header = stream.read(65536).split(b'end_header')[0].decode(errors='replace')
-    faces = [line.split()[-1] for line in header.splitlines() if line.startswith('element face')]
-    reader = _read_mesh if faces and faces[0] != '0' else _read_cloud
-    return reader(path, spacing, viewpoint, seed)
-
-
-def _read_cloud(path: Path, spacing, viewpoint, seed) -> PriorMap:
-    import open3d
-
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        try:
-            cloud = open3d.t.io.read_point_cloud(
-                str(path), remove_nan_points=False, remove_infinite_points=False
-            )
-        except RuntimeError as error:
-            raise MapError(f'{path}: not a readable point cloud ({error})') from None
-    if 'positions' not in cloud.point or len(cloud.point.positions) == 0:
-        raise MapError(f'{path}: holds no points (or is not a valid {path.suffix} file)')
-    fields = {
-        name: cloud.point[name].numpy().astype(np.float64)
-        for name in ('positions', 'normals', 'planarity')
-        if name in cloud.point
-    }
-    planarity = fields['planarity'].ravel() if 'planarity' in fields else None
-    return map_from_cloud(
-        fields['positions'],
-        fields.get('normals'),
-        planarity,
-        viewpoint=viewpoint,
-        source=str(path),
-    )
-
-
-def _read_mesh(path: Path, spacing, viewpoint, seed) -> PriorMap:
-    import trimesh
-
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh's parsers raise whatever they stumble on
-        raise MapError(f'{path}: not a readable mesh ({error})') from None
-    if len(getattr(mesh, 'faces', ())) == 0:
-        raise MapError(f'{path}: holds no faces')
-    chosen = {'count': 300_000} if spacing is None else {'spacing': spacing}
-    return sample_mesh(mesh.vertices, mesh.faces, seed=seed, source=str(path), **chosen)
-
-
-_READERS = {
-    '.npz': _read_npz,
-    '.ply': _read_ply,
-    '.pcd': _read_cloud,
-    '.xyz': _read_text,
-    '.csv': _read_text,
-    '.stl': _read_mesh,
-    '.obj': _read_mesh,
-}
+def _numbers(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
+    if arrays[name].dtype.kind not in 'fiu':
+        raise ValueError(f'{name} are of type {arrays[name].dtype}')
+    return arrays[name]

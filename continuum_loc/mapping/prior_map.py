@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from continuum_loc.mapping.voxel_index import VoxelIndex
 import numpy as np
 
 CLOUD_COLUMNS = ('x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity')
+FARTHEST = 1e9  # m: of a coordinate; squares and cubes of it can still be computed with
 NPZ_FORMAT = 'continuum_loc prior map 1'
 
 
@@ -28,6 +30,7 @@ class PriorMap:
     sigma: standard deviation of a point [m] (Sigma_nn of eq. 12 is built from it and from
     `spacing`).
     spacing: typical distance from a point to its nearest neighbour [m].
+    notes: what was left out of the file that the map is from, or aside, in words.
     """
 
     points: np.ndarray
@@ -38,6 +41,7 @@ class PriorMap:
     oriented: bool = True
     source: str = ''
     seed: int | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         _require_columns(self)
@@ -48,6 +52,11 @@ class PriorMap:
         _refuse_rows(self, ~np.isfinite(self.points).all(axis=1), 'points must be finite')
         _refuse_rows(
             self,
+            np.abs(self.points).max(axis=1) > FARTHEST,
+            f'points must be within {FARTHEST:g} m of 0',
+        )
+        _refuse_rows(
+            self,
             ~(np.abs(np.linalg.norm(self.normals, axis=1) - 1.0) < 1e-6),
             'normals must have length 1',
         )
@@ -56,9 +65,9 @@ class PriorMap:
             ~((self.planarity >= 0.0) & (self.planarity <= 1.0)),
             'planarity must lie in [0, 1]',
         )
-        if not (self.sigma > 0.0 and self.spacing >= 0.0):
+        if not (0.0 < self.sigma < np.inf and 0.0 <= self.spacing < np.inf):
             raise MapError(
-                f'{self._name}: sigma must be > 0 and spacing >= 0, '
+                f'{self._name}: sigma must be > 0 and spacing >= 0, and both finite, '
                 f'got {self.sigma}, {self.spacing}'
             )
 
@@ -69,9 +78,10 @@ class PriorMap:
     def _name(self) -> str:
         return self.source or 'prior map'
 
-    def index(self, reach: float = 0.1) -> VoxelIndex:
-        """Make a new nearest-neighbour index of the map; rows it returns are rows of this map."""
-        return VoxelIndex(self.points, self.normals, reach=reach)
+    @cached_property
+    def index(self) -> VoxelIndex:
+        """Nearest-neighbour index, made once for all users; its rows are rows of this map."""
+        return VoxelIndex(self.points, self.normals)
 
     def save(self, path: str | Path) -> None:
         """
@@ -128,6 +138,8 @@ def _refuse_rows(prior: PriorMap, bad: np.ndarray, rule: str) -> None:
 def _write_npz(prior: PriorMap, path: Path) -> None:
     arrays = {name: getattr(prior, name) for name in ('points', 'normals', 'planarity')}
     about = {key: value for key, value in asdict(prior).items() if key not in arrays}
+    if not prior.notes:  # so that versions without notes read most maps too
+        del about['notes']
     with path.open('wb') as stream:
         np.savez(stream, format=NPZ_FORMAT, about=json.dumps(about), **arrays)
 

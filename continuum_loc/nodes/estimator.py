@@ -43,6 +43,7 @@ class EstimatorNode(WorkerNode):
         self.filter_settings = parameters.declare(self, self._preset(), FILTER)
         self.check_parameters()
         self.prior_map = self._load_map()
+        self.get_logger().info('compiling, or loading what an earlier run compiled')
         self.filter = self._new_filter(self.robot)
         self.estimate: Estimate | None = None
         self.recent = RecentPoses(self.settings.trajectory_seconds)
@@ -226,12 +227,9 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def _new_filter(self, robot: RobotDescription) -> SlidingWindowFilter:
-        """Make a filter without a past, which no graph asks for, and with all its memory."""
+        """Make a filter without a past, which no graph asks for."""
         settings = self.filter_settings.model_copy(update={'history': 0.0})
-        made = SlidingWindowFilter(robot, self.prior_map, settings)
-        if made.tof is not None:
-            made.tof.index.reserve()
-        return made
+        return SlidingWindowFilter(robot, self.prior_map, settings)
 
     def _preset(self) -> EstimatorSettings:
         """Use the settings asked for, else those bundled for this robot, else the library's."""
@@ -247,13 +245,15 @@ class EstimatorNode(WorkerNode):
         if not self.settings.map:
             self.get_logger().warning('no prior map: ToF sensors cannot be used (parameter `map`)')
             return None
-        from continuum_loc.mapping.map_files import load_map
+        from continuum_loc.mapping.scale import map_for
 
-        return load_map(self.settings.map)
+        prior = map_for(self.robot, self.settings.map)
+        for note in prior.notes:
+            self.get_logger().warning(f'{self.settings.map}: {note}')
+        return prior
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:
-            self.get_logger().info('compiling, or loading what an earlier run compiled')
             warm_up(self.robot, self.prior_map, self.filter_settings, self.scene)
 
 

@@ -26,6 +26,7 @@ from msg_tools.topics import INPUTS, topic_spec, TOPICS, TRACKER
 from rosgraph_msgs.msg import Clock
 
 LOOKAHEAD = 0.5  # s
+LONGEST_PAUSE = 10.0  # s of the log; a longer one, as another clock makes it, is skipped
 CLOCK = '/clock'
 
 
@@ -43,18 +44,15 @@ class ReplayerNode(PackageNode):
         )
         self._paced: Paced | None = None
         self._stop = threading.Event()
-        self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._play, name='player', daemon=True)
+        self._thread = self.thread(self._play, 'player')
         self._thread.start()
 
     def close(self) -> None:
-        """Stop playing; raise what ended it, if anything did."""
+        """Stop playing."""
         self._stop.set()
         if self._paced is not None:
             self._paced.stop()
         self._thread.join(timeout=10.0)
-        if self._failure is not None:
-            raise self._failure
 
     def _topics(self) -> list[str]:
         with open_bag(self.path) as reader:
@@ -87,17 +85,13 @@ class ReplayerNode(PackageNode):
         return self.create_publisher(ros_messages().resolve(spec.type), topic, output_qos(spec))
 
     def _play(self) -> None:
-        try:
-            going = self._wait_for_listeners()
-            while going and not self._stop.is_set():
-                self._paced = Paced(self._entries(), LOOKAHEAD, self.settings.rate)
-                self._paced.run(self._deliver)
-                going = self.settings.loop
-            if not self._stop.is_set():
-                await_acknowledged(self.outputs.values())
-        except BaseException as error:
-            if self.context.ok():
-                self._failure = error
+        going = self._wait_for_listeners()
+        while going and not self._stop.is_set():
+            self._paced = Paced(self._entries(), LOOKAHEAD, self.settings.rate, LONGEST_PAUSE)
+            self._paced.run(self._deliver)
+            going = self.settings.loop
+        if not self._stop.is_set():
+            await_acknowledged(self.outputs.values())
         self.finish()
 
     def _wait_for_listeners(self) -> bool:
@@ -119,7 +113,8 @@ class ReplayerNode(PackageNode):
         for topic, stamp, data in raw_messages(
             self.path, tuple(self.outputs), self.settings.namespace_in_bag
         ):
-            tick = tick or stamp
+            if not 0 <= stamp - tick <= nanoseconds(LONGEST_PAUSE):
+                tick = stamp
             while self._clock_output is not None and tick <= stamp:
                 yield tick, (CLOCK, b'')
                 tick += period

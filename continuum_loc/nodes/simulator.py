@@ -1,7 +1,7 @@
 """
-Node `simulator`: a robot in a scene, publishing every sensor in real time.
+Node `simulator`: a robot in a scene publishes every sensor in real time.
 
-See config/simulator.yaml.
+Its parameters are explained in config/simulator.yaml.
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import hashlib
 import json
 from pathlib import Path
 import traceback
@@ -13,22 +12,23 @@ from typing import Any
 from continuum_loc.errors import BagError
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
+from continuum_loc.mapping.scale import map_for
+from continuum_loc.offline.account import account_of
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import figures, lost_share, ring_rows
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.parallel import (
     configuration_digest,
     Outcome,
     parallel,
     show_progress,
 )
-from continuum_loc.offline.replay import replay, ReplayResult
-from continuum_loc.offline.runs import save_run
-from continuum_loc.offline.source import replay_digest
+from continuum_loc.offline.replay import replay
+from continuum_loc.offline.runs import save_run, summary_of
+from continuum_loc.offline.source import content_digest, replay_digest
 from continuum_loc.offline.study_report import write_study_report
-from continuum_loc.offline.trials import make_filter
 from continuum_loc.robot import RobotDescription
-
-BAG_SUFFIXES = ('.mcap', '.db3')
+from msg_tools.bag import BAG_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def evaluate_bags(
     The one claim is that none failed. Raises BagError or MapError before any work.
     """
     trials = bag_trials(folder)
-    load_map(map_file)  # a map that cannot be read is no bag's fault
+    map_for(robot, map_file)  # a map that cannot be used is no bag's fault
     work = [(trial, robot, map_file, settings, out) for trial in trials]
     outcomes = sorted(
         show_progress(parallel(replay_bag, work, jobs), len(work), 'estimating'),
@@ -144,7 +144,9 @@ def _summary(
             return summary
     (folder / 'error.txt').unlink(missing_ok=True)
     result = replay(trial.bag, make_filter(robot, load_map(map_file), settings))
-    require_estimates(result, robot)
+    account = account_of(robot, settings, result.counts, summary_of(result))
+    if account['problems']:
+        raise BagError('; '.join(account['problems']))
     return save_run(
         folder,
         result,
@@ -158,31 +160,6 @@ def _summary(
         },
         extra={'configuration_digest': key},
     )
-
-
-def require_estimates(result: ReplayResult, robot: RobotDescription) -> None:
-    """Raise BagError where a recording gave no estimate, with what became of its samples."""
-    if len(result.track):
-        return
-    counted = (
-        f'{what} {", ".join(f"{count} {name}" for name, count in result.counts[what].items())}'
-        for what in ('received', 'used', 'dropped')
-        if result.counts[what]
-    )
-    raise BagError(
-        f"no estimate: {'; '.join(counted) or 'no measurement in it'}; robot '{robot.name}' has "
-        f'the ToF sensors {", ".join(one.name for one in robot.tof) or "none"}'
-    )
-
-
-def content_digest(path: Path) -> str:
-    """Digest a file, or all files in a folder, to the byte."""
-    digest = hashlib.sha256()
-    inside = sorted(each for each in path.rglob('*') if each.is_file())
-    for each in inside if path.is_dir() else [path]:
-        with each.open('rb') as stream:
-            digest.update(hashlib.file_digest(stream, 'sha256').digest())
-    return digest.hexdigest()
 
 
 def bag_rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:

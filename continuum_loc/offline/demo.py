@@ -14,13 +14,17 @@ from typing import Any
 from continuum_loc.estimator.settings import settings_of
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import TofFrame
+from continuum_loc.offline.account import account_of
 from continuum_loc.offline.claims import at_least, at_most, Claim
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.metrics import errors, summarise
 from continuum_loc.offline.replay import place_points, ReplayResult, samples_of
 from continuum_loc.offline.replay import replay as run_replay
 from continuum_loc.offline.report import context_of, write_report
-from continuum_loc.offline.runs import distribution, load_run, new_run, save_run
-from continuum_loc.offline.trials import configuration, make_filter, scene_map_file, Trial
+from continuum_loc.offline.runs import distribution, load_run, new_run, save_run, summary_of
+from continuum_loc.offline.scene_maps import scene_map_file
+from continuum_loc.offline.trial_runs import configuration
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.trajectory import BASE, Trajectory
 import numpy as np
@@ -78,6 +82,11 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
     )
     identical = replays[0].digest == replays[1].digest
     claims = demo_claims(shown, live.lost, identical)
+    counts = {
+        **live.counts['filter'],
+        'intake': live.counts['estimator'],
+        'suspects': replays[0].counts['suspects'],  # the topics do not say
+    }
     summary = save_run(
         folder,
         shown,
@@ -85,6 +94,7 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
         seed=trial.seed,
         configuration=configuration(trial, estimator=settings, map={'file': map_file}, bag=bag),
         extra={
+            'account': account_of(robot, settings, counts, summary_of(shown)),
             'claims': claims,
             'live_step_ms': live.step_ms,
             'lost_messages': live.lost,

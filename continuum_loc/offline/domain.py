@@ -1,8 +1,4 @@
-"""
-ROS domains of one's own: two graphs on one machine would otherwise hear each other.
-
-Nothing here imports rclpy.
-"""
+"""ROS domains of one's own: two graphs on one machine would otherwise hear each other."""
 
 from __future__ import annotations
 

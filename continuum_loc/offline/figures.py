@@ -43,9 +43,7 @@ def error_figure(found: Errors, kind: str, lost: np.ndarray, epoch: int) -> go.F
     """
     One panel per ring: the error over time above its 3-sigma band.
 
-    `kind` is `translation` or `rotation`.
-
-    lost: (K,) bool, shaded. epoch: stamp of time zero.
+    kind: `translation` or `rotation`. lost: (K,) bool, shaded. epoch: stamp of time zero.
     """
     from plotly.subplots import make_subplots
 
@@ -138,9 +136,9 @@ def ceiling(values: np.ndarray, band: np.ndarray) -> float:
 
 def component_figure(found: Errors, epoch: int) -> go.Figure:
     """
-    Plot the six components of the pose error of one ring, each with plus and minus 3 sigma.
+    Plot the six components of a ring's pose error between plus and minus 3 sigma.
 
-    The ring is chosen from a menu.
+    A menu in the figure chooses the ring.
     """
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots

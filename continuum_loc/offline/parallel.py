@@ -11,7 +11,7 @@ import json
 from typing import Any
 
 from continuum_loc.errors import StudyError
-from continuum_loc.offline.claims import plain
+from continuum_loc.offline.as_json import plain
 from continuum_loc.offline.replay import one_thread
 
 # Address of a Dask scheduler that runs the work instead of processes of our own; none by default.

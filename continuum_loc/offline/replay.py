@@ -1,19 +1,22 @@
 """
 Run a filter over recorded measurements without a ROS graph.
 
-The same bag gives the same estimate, bit for bit.
+What it gets has passed the same gate (`intake.Intake`) as in a live node, with the log of the bag
+as the clock. The same bag gives the same estimate, bit for bit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 import hashlib
 from pathlib import Path
 import time
 from typing import Any, Protocol
 
+from continuum_loc.errors import BagError, MessageError
 from continuum_loc.estimate import Estimate
+from continuum_loc.intake import Intake
 from continuum_loc.measurements import (
     EncoderSample,
     FieldSample,
@@ -28,8 +31,11 @@ from continuum_loc.measurements import (
     TrackedPose,
     TruthSample,
 )
+from continuum_loc.offline.account import Suspicion, TRUTH
 from continuum_loc.robot import RobotDescription
 from continuum_loc.trajectory import known_at, Trajectory
+from msg_tools.factory import deserialize
+from msg_tools.topics import INPUTS, topic_of, TRACKER
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -45,6 +51,7 @@ class Filter(Protocol):
 
     def process(self, measurement: Measurement) -> Estimate | None: ...
     def flush(self) -> Estimate | None: ...
+    def reset(self) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,17 +120,67 @@ def samples_of(bag: str | Path) -> Iterator[Measurement | TruthSample]:
 
 
 def replay(
-    source: str | Path | Iterable[Measurement | TruthSample], estimator: Filter
+    source: str | Path | Iterable[Measurement | TruthSample],
+    estimator: Filter,
+    *,
+    namespace: str = '',
+    frame_prefix: str = '',
+    strict: bool = False,
+    progress: Callable[[float], None] = lambda elapsed: None,
 ) -> ReplayResult:
     """
     Feed a bag (its path) or samples in stamp order to `estimator`.
 
-    It runs in this thread, as fast as it goes.
+    It runs in this thread, as fast as it goes. What cannot be used is counted, and the rest used;
+    where the estimator fails on what a bag gave it, that is counted too, and it starts anew.
+    `strict`: the first of either is raised. namespace, frame_prefix: those of the robot in a bag
+    of several. progress: told the time of the log [s]. Raises BagError where the bag cannot be
+    read.
     """
+    intake = Intake(estimator.robot, frame_prefix=frame_prefix, strict=strict)
     with one_thread():
-        return _replay(
-            samples_of(source) if isinstance(source, (str, Path)) else source, estimator
-        )
+        if not isinstance(source, (str, Path)):
+            return _replay(_given(source, intake), estimator, intake)
+        inputs = getattr(estimator, 'inputs', (*INPUTS, TRACKER))
+        offered = _recorded(Path(source), inputs, intake, namespace, progress)
+        return _replay(offered, estimator, intake, intake.attempt)
+
+
+def _given(samples: Iterable[Measurement | TruthSample], intake: Intake) -> Iterator:
+    """(topic, sample) of those that pass the gate."""
+    for sample in samples:
+        topic = topic_of(sample)
+        passed = intake.admit(topic, sample, sample.stamp)
+        if passed is not None:
+            yield topic, passed
+
+
+def _recorded(
+    bag: Path,
+    inputs: tuple[str, ...],
+    intake: Intake,
+    namespace: str,
+    progress: Callable[[float], None],
+) -> Iterator:
+    """(topic, sample) of a bag's messages that pass the gate."""
+    from msg_tools.bag import raw_messages
+
+    def mistyped(topic: str, count: int, text: str) -> None:
+        if topic in inputs:
+            intake.received[topic] += count
+            intake.refuse('type', text, topic, count)
+
+    first = None
+    for topic, logged, data in raw_messages(bag, (*inputs, TRUTH), namespace, mistyped):
+        first = logged if first is None else first
+        progress(seconds(logged, first))
+        try:
+            message = intake.parse(topic, data, deserialize)
+            sample = None if message is None else intake.accept(topic, message, logged)
+        except MessageError as error:  # a strict gate's
+            raise BagError(f'{bag}: {error} (logged at {logged / NANOSECONDS:.6f} s)') from None
+        if sample is not None:
+            yield topic, sample
 
 
 def one_thread() -> threadpool_limits:
@@ -138,16 +195,27 @@ def one_thread() -> threadpool_limits:
     return threadpool_limits(1)
 
 
-def _replay(samples: Iterable[Measurement | TruthSample], estimator: Filter) -> ReplayResult:
+def _replay(
+    offered: Iterator,
+    estimator: Filter,
+    intake: Intake,
+    attempt: Callable[[Callable[[], None], str], None] = lambda action, what: action(),
+) -> ReplayResult:
     log = _Log(estimator.robot)
-    for sample in samples:
+
+    def restart() -> None:
+        estimator.reset()
+        log.restart()
+
+    intake.restart = restart
+    for topic, sample in offered:
         if isinstance(sample, TruthSample):
             log.truth.append(sample)
             continue
         log.received(sample)
-        log.step(estimator.process, sample)
-    log.step(estimator.flush)
-    return log.result(estimator.counts)
+        attempt(lambda sample=sample: log.step(estimator.process, sample), topic)
+    attempt(lambda: log.step(estimator.flush), 'the end')
+    return log.result({**estimator.counts, 'intake': intake.counts()})
 
 
 class _Log:
@@ -160,11 +228,19 @@ class _Log:
         self.frames: list[TofFrame] = []
         self.step_seconds: list[float] = []
         self.processing_seconds = self.cpu_seconds = 0.0
-        self.first, self.last = np.iinfo(np.int64).max, 0
+        self.data_time = 0  # ns
+        self.suspicion = Suspicion()
+        self.restart()
+
+    def restart(self) -> None:
+        """Start anew: earlier and later stamps have nothing in common."""
+        self._span: tuple[int, int] | None = None
         self._next_frame: dict[str, int] = {}
 
     def received(self, sample: Measurement) -> None:
-        self.first, self.last = min(self.first, sample.stamp), max(self.last, sample.stamp)
+        first, last = self._span or (sample.stamp, sample.stamp)
+        self._span = min(first, sample.stamp), max(last, sample.stamp)
+        self.data_time += (self._span[1] - self._span[0]) - (last - first)
         if isinstance(sample, TofFrame) and sample.stamp >= self._next_frame.get(sample.sensor, 0):
             self.frames.append(sample)
             self._next_frame[sample.sensor] = sample.stamp + CLOUD_PERIOD
@@ -178,6 +254,7 @@ class _Log:
         if estimate is not None:
             self.estimates.append(estimate)
             self.step_seconds.append(elapsed)
+            self.suspicion.note(estimate)
 
     def result(self, counts: dict[str, Any]) -> ReplayResult:
         names = self.robot.ring_names
@@ -192,9 +269,9 @@ class _Log:
             consistency=np.array([latest[stamp] for stamp in sorted(latest)], float),
             step_seconds=np.array(self.step_seconds),
             processing_seconds=self.processing_seconds,
-            data_seconds=max(seconds(self.last, self.first), 0.0) if self.last else 0.0,
+            data_seconds=seconds(self.data_time),
             cloud=place_points(self.frames, track, self.robot),
-            counts=counts,
+            counts={**counts, 'suspects': self.suspicion.table()},
             cpu_seconds=self.cpu_seconds,
         )
 

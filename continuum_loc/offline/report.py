@@ -13,6 +13,7 @@ from typing import Any
 
 from continuum_loc.measurements import NANOSECONDS
 from continuum_loc.offline import figures
+from continuum_loc.offline.account import account_lines
 from continuum_loc.offline.metrics import DOF, Errors, errors
 from continuum_loc.offline.runs import Run, settled
 from continuum_loc.offline.view import moments, surroundings
@@ -94,7 +95,7 @@ def context_of(run: Run) -> Context:
     """Find the scene and the prior map that the run's configuration names, if they still are."""
     from continuum_loc.errors import MapError, SceneError
     from continuum_loc.mapping.map_files import load_map
-    from continuum_loc.offline.trials import scene_map
+    from continuum_loc.offline.scene_maps import scene_map
     from continuum_loc.simulator.scenes import load_scene
 
     mesh = map_points = None
@@ -165,6 +166,7 @@ def run_page(run: Run, context: Context) -> Page:
                 figure=chart(figures.consistency_figure(result, found)),
             )
         ],
+        [Part('What came of it', table=account_table(summary))] if 'account' in summary else [],
         [Part('Measurements', table=counts_table(summary['counts']))],
     ]
     return Page(
@@ -260,6 +262,11 @@ def ring_table(summary: Mapping[str, Any]) -> Table:
         columns,
         [*rows, row('all rings', summary, total=True), row('base (given)', summary['base'])],
     )
+
+
+def account_table(summary: Mapping[str, Any]) -> Table:
+    """List what the terminal said at the end, a line each."""
+    return Table([''], [Row([line]) for line in account_lines(summary['account'])])
 
 
 def counts_table(counts: Mapping[str, Any]) -> Table:

@@ -8,7 +8,7 @@ runs/latest        -> 0007-replay
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 import json
 import os
@@ -17,12 +17,15 @@ import re
 from typing import Any
 
 from continuum_loc.errors import RunError
-from continuum_loc.offline.claims import plain, versions, write_json
+from continuum_loc.npz_files import read_arrays
+from continuum_loc.offline.account import account_of
+from continuum_loc.offline.as_json import plain, versions, write_json
 from continuum_loc.offline.metrics import Errors, errors, longest_stretch, summarise
 from continuum_loc.offline.replay import Cloud, ReplayResult
+from continuum_loc.robot import RobotDescription
 from continuum_loc.trajectory import associate, save_tum, Trajectory
+from continuum_loc.yaml_files import read_yaml, write_yaml
 import numpy as np
-import yaml
 
 LOST_ERROR = 0.05  # m: a ring that is off by more is not where the filter says
 TRACKS = ('track', 'lagged', 'truth')
@@ -82,21 +85,24 @@ def save_run(
     """
     Write the run's files (all but the report) and return its summary.
 
-    `extra` adds keys to the summary.
+    configuration: everything that the run was made from; the account in the summary asks for
+    `robot` and `estimator` in it. `extra` adds keys to the summary.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    found = summary_of(result)
+    robot, settings = (configuration.get(name) for name in ('robot', 'estimator'))
+    if isinstance(robot, RobotDescription) and 'intake' in result.counts:
+        found['account'] = account_of(robot, settings, result.counts, found)
     summary = {
         'kind': kind,
-        **summary_of(result),
+        **found,
         **(extra or {}),
         'seed': seed,
         'versions': versions(),
     }
     write_json(folder / 'summary.json', summary)
-    (folder / 'configuration.yaml').write_text(
-        yaml.safe_dump(plain(configuration), sort_keys=False)
-    )
+    write_yaml(plain(configuration), folder / 'configuration.yaml')
     tracks = (result.track, result.lagged, judged_truth(result))
     for track, prefix in zip(tracks, ('estimate', 'lagged', 'truth'), strict=True):
         save_tum(track, folder / 'trajectories', prefix)
@@ -132,6 +138,9 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
                 for name in ('initialising', 'tracking', 'lost')
             },
         },
+        'consistency': float(np.median(result.consistency))
+        if len(result.consistency)
+        else float('nan'),
         'counts': result.counts,
         'digest': result.digest,
     }
@@ -192,23 +201,32 @@ def distribution(values: np.ndarray) -> dict[str, float]:
 
 
 def load_run(folder: str | Path) -> Run:
-    """Read a run folder. Raises RunError naming the missing file."""
+    """Read a run folder. Raises RunError naming the file that is missing or damaged."""
     folder = Path(folder)
     for name in ('summary.json', 'configuration.yaml', 'result.npz'):
         if not (folder / name).is_file():
             raise RunError(f'{folder} is no run folder: it has no {name}')
-    try:
-        result = _load_result(folder / 'result.npz')
-    except (KeyError, ValueError, OSError) as error:
-        raise RunError(
-            f'{folder / "result.npz"}: damaged, or of another version of this package ({error})'
-        ) from None
     return Run(
         folder.resolve(),
-        json.loads((folder / 'summary.json').read_text()),
-        yaml.safe_load((folder / 'configuration.yaml').read_text()),
-        result,
+        _read(folder / 'summary.json', lambda path: _mapping(json.loads(path.read_text()))),
+        _read(folder / 'configuration.yaml', lambda path: _mapping(read_yaml(path).data)),
+        _read(folder / 'result.npz', _load_result),
     )
+
+
+def _read(path: Path, read: Callable[[Path], Any]) -> Any:
+    try:
+        return read(path)
+    except (LookupError, ValueError, TypeError, OSError, RecursionError) as error:
+        raise RunError(
+            f'{path}: damaged, or of another version of this package ({error})'
+        ) from None
+
+
+def _mapping(data: Any) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise ValueError(f'expected a mapping of keys, got {type(data).__name__}')
+    return data
 
 
 def _save_result(path: Path, result: ReplayResult) -> None:
@@ -235,8 +253,7 @@ def _save_result(path: Path, result: ReplayResult) -> None:
 
 
 def _load_result(path: Path) -> ReplayResult:
-    with np.load(path, allow_pickle=False) as stored:
-        data = dict(stored)
+    data = read_arrays(path)
     names = tuple(str(name) for name in data['names'])
 
     def track(prefix: str) -> Trajectory:

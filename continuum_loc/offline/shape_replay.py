@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from typing import Any
+
 from continuum_loc.errors import SettingsError
 from continuum_loc.estimate import Estimate
-from continuum_loc.measurements import FieldSample, ImuSample, Measurement
+from continuum_loc.measurements import Measurement
 from continuum_loc.robot import RobotDescription
 from continuum_loc.shape import ShapeEstimate, ShapeEstimator, ShapeSettings
 import numpy as np
@@ -14,11 +17,11 @@ class ShapeReplay:
     """
     `ShapeEstimator` in the form that `replay.replay` asks of a filter.
 
-    Poses are those of the modules' rings.
-
-    The base is where the description says, exactly; strain and velocity are not estimated, and
-    nan.
+    Poses are those of the modules' rings. The base is where the description says, exactly; strain
+    and velocity are not estimated, and nan.
     """
+
+    inputs = ('imu/data_raw', 'imu/mag')
 
     def __init__(self, robot: RobotDescription, settings: ShapeSettings) -> None:
         self.estimator = ShapeEstimator(robot, settings)
@@ -29,29 +32,63 @@ class ShapeReplay:
                 f'{", ".join(self.estimator.module_names) or "none"}'
             )
         self.robot, self.settings = robot, settings
+        self._received: Counter[str] = Counter()
+        self._used: Counter[str] = Counter()
+        self._earlier: Counter[str] = Counter()  # than the last new start
+        self._points: int | None = None
 
     @property
-    def counts(self) -> dict:
-        """Count what the estimator received and used."""
-        return {'samples': dict(self.estimator.counts)}
+    def counts(self) -> dict[str, Any]:
+        """Count what the estimator received, used by kind, and dropped by reason."""
+        counted = self._earlier + self.estimator.counts
+        counted.pop('used', None)
+        return {
+            'received': dict(self._received),
+            'used': dict(self._used),
+            'dropped': dict(counted),
+        }
 
     def process(self, measurement: Measurement) -> Estimate | None:
-        """One sample; kinds that shape does not use are passed by."""
-        if not isinstance(measurement, (ImuSample, FieldSample)):
-            return None
+        """Take one sample; an estimate when one fell due."""
+        kind, before = type(measurement).__name__, self.estimator.counts['used']
+        self._received[kind] += 1
         shape = self.estimator.process(measurement)
-        return None if shape is None else as_estimate(shape, self.robot.base.T_map_base)
+        self._used[kind] += self.estimator.counts['used'] - before
+        if shape is None:
+            return None
+        curve, s = self._evened(shape)
+        return as_estimate(shape, curve, s, self.robot.base.T_map_base)
+
+    def reset(self) -> None:
+        """Start over with taring."""
+        self._earlier += self.estimator.counts
+        self.estimator.reset()
 
     def flush(self) -> None:
         """Nothing is pending: every estimate is made at its instant."""
 
+    def _evened(self, shape: ShapeEstimate) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Give the curve as many points as the first one had.
 
-def as_estimate(shape: ShapeEstimate, T_map_base: np.ndarray) -> Estimate:
-    """Give the shape as an `Estimate` of base and rings."""
+        How many it takes from the last module to the tip depends on where the module is.
+        """
+        curve, s = shape.curve, shape.curve_s
+        self._points = self._points or len(s)
+        if len(s) == self._points:
+            return curve, s
+        at = np.linspace(s[0], s[-1], self._points)
+        return np.column_stack([np.interp(at, s, column) for column in curve.T]), at
+
+
+def as_estimate(
+    shape: ShapeEstimate, curve: np.ndarray, curve_s: np.ndarray, T_map_base: np.ndarray
+) -> Estimate:
+    """Give the shape and a curve (C, 3) at arclengths (C,) as an `Estimate` of base and rings."""
     rings = 1 + len(shape.modules)
     unknown = np.full((rings, 6), np.nan)
-    T_map_backbone = np.tile(np.eye(4), (len(shape.curve), 1, 1))
-    T_map_backbone[:, :3, 3] = shape.curve
+    T_map_backbone = np.tile(np.eye(4), (len(curve), 1, 1))
+    T_map_backbone[:, :3, 3] = curve
     return Estimate(
         stamp=shape.stamp,
         T_map_ring=np.concatenate([T_map_base[None], shape.T_map_module]),
@@ -59,7 +96,7 @@ def as_estimate(shape: ShapeEstimate, T_map_base: np.ndarray) -> Estimate:
         strain=unknown,
         velocity=unknown,
         velocity_covariance=np.full((rings, 6, 6), np.nan),
-        backbone_s=shape.curve_s,
+        backbone_s=curve_s,
         T_map_backbone=T_map_backbone,
         status='lost' if shape.faults else 'tracking',
         consistency=shape.consistency,

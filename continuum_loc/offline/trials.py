@@ -1,7 +1,8 @@
 """
-One trial: a robot simulated in a scene, a prior map, and the filter over the samples.
+One trial: a robot, simulated in a scene along a trajectory, and its recording.
 
-Studies, tests and the command line all build their trials here.
+Studies, tests and the command line all build their trials here. What this module imports decides
+what a recording holds, and nothing else does: the filter has no place here (see `source`).
 """
 
 from __future__ import annotations
@@ -9,24 +10,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 import hashlib
-import os
 from pathlib import Path
 import shutil
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from continuum_loc import lie
 from continuum_loc.measurements import Measurement, TruthSample
-from continuum_loc.offline.replay import Filter, replay, ReplayResult
 from continuum_loc.robot import load_robot, RobotDescription
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from continuum_loc.estimator.settings import EstimatorSettings
-    from continuum_loc.mapping.prior_map import PriorMap
+    from continuum_loc.simulator.departures import Departures
     from continuum_loc.simulator.world import World
 
-MAP_POINTS = 300_000
 # What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF
 # stamps share.
 MOUNTING_ERROR = (0.002, 1.0)  # m, deg
@@ -43,6 +40,8 @@ class Trial:
     map is that of `map_scene` (default: the scene's own). profile: `live` or `full`. fidelity:
     `paper` or `vl53l5cx`. plant: a bundled name or a YAML file; None for the robot's own.
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
+    world: `ideal`, or a file of true departures (`simulator.departures`), which also says what ToF
+    sensors it has; the prior map departs with it.
     drawn_base: the base sits where a draw from the description's own spread puts it, not where
     the description says: what a covariance that counts with this spread has to be judged by.
     duration: seconds; None for the trajectory's own.
@@ -59,6 +58,17 @@ class Trial:
     seed: int = 0
     duration: float | None = None
     plant: str | None = None
+    world: str = 'ideal'
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'fidelity', self.departures.fidelity(self.fidelity))
+
+    @property
+    def departures(self) -> Departures:
+        """In what the trial's world departs from the files that the estimator reads."""
+        from continuum_loc.simulator.departures import load_departures
+
+        return load_departures(self.world)
 
     @property
     def recording(self) -> str:
@@ -75,6 +85,7 @@ class Trial:
                 ]
                 + ['disturbed'] * self.disturbed
                 + ['drawn'] * self.drawn_base
+                + [f'world_{_world_name(self.world)}'] * (self.world != 'ideal')
                 + [Path(self.plant or '').stem] * bool(self.plant)
             )
             + f'-{self.seed}{length}'
@@ -84,6 +95,14 @@ class Trial:
     def name(self) -> str:
         """Name the trial, uniquely among trials."""
         return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
+
+
+def _world_name(world: str) -> str:
+    """Name a world in a folder's name; a file of one's own by what it says."""
+    name, _, parts = world.partition(':')
+    own = Path(name).suffix in ('.yaml', '.yml')
+    said = f'_{hashlib.sha256(Path(name).read_bytes()).hexdigest()[:8]}' if own else ''
+    return f'{Path(name).stem}{said}{"_" * bool(parts)}{parts.replace("+", "_")}'
 
 
 def world(trial: Trial, faults: tuple = ()) -> World:
@@ -96,9 +115,24 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         robot = _base_drawn(robot, trial.seed)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
+    scene = load_scene(trial.scene) if robot.tof else None
+    if trial.world != 'ideal':
+        from continuum_loc.offline.disturbed import true_world
+
+        return true_world(
+            robot,
+            scene,
+            trial.trajectory,
+            trial.departures,
+            seed=trial.seed,
+            fidelity=trial.fidelity,
+            plant=trial.plant,
+            profile=trial.profile,
+            faults=faults,
+        )
     return World(
         robot,
-        load_scene(trial.scene) if robot.tof else None,
+        scene,
         trial.trajectory,
         plant=trial.plant,
         profile=trial.profile,
@@ -143,71 +177,6 @@ def measured(trial: Trial) -> list[Measurement]:
     return [sample for sample in simulate(trial) if not isinstance(sample, TruthSample)]
 
 
-def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
-    """Simulate and estimate, both in this thread; only the estimator is timed."""
-    robot = load_robot(trial.robot)
-    return replay(
-        simulate(trial),
-        make_filter(
-            robot, scene_map(trial.map_scene or trial.scene), settings or trial_settings(trial)
-        ),
-    )
-
-
-def trial_settings(trial: Trial) -> EstimatorSettings:
-    """Load the settings for the robot with sensors of the trial's fidelity, else the robot's."""
-    from continuum_loc.estimator.settings import PRESETS_FOLDER, settings_of
-
-    robot = load_robot(trial.robot).name
-    special = f'{robot}_{trial.fidelity}'
-    return settings_of(special if (PRESETS_FOLDER / f'{special}.yaml').is_file() else robot)
-
-
-def make_filter(
-    robot: RobotDescription, prior_map: PriorMap | None, settings: EstimatorSettings | None = None
-) -> Filter:
-    """Make the sliding-window filter, by default with the settings that come with the robot."""
-    from continuum_loc.estimator import settings_of, SlidingWindowFilter
-
-    return SlidingWindowFilter(robot, prior_map, settings or settings_of(robot.name))
-
-
-def scene_map(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> PriorMap:
-    """Return the prior map of a scene, sampled from its mesh once and kept on disk."""
-    from continuum_loc.mapping.map_files import load_map
-
-    return load_map(scene_map_file(scene_name, points, seed))
-
-
-def scene_map_file(scene_name: str | Path, points: int = MAP_POINTS, seed: int = 0) -> Path:
-    """
-    Name the file of `scene_map`.
-
-    Its name holds a digest of the mesh, so that a changed scene has a new map.
-    """
-    from continuum_loc.mapping.build import sample_mesh
-    from continuum_loc.simulator.scenes import load_scene
-
-    scene = load_scene(scene_name)
-    digest = hashlib.sha256(scene.vertices.tobytes() + scene.faces.tobytes()).hexdigest()[:16]
-    path = map_cache() / f'{Path(scene_name).stem}-{points}-{seed}-{digest}.npz'
-    if not path.is_file():
-        prior = sample_mesh(
-            scene.vertices, scene.faces, count=points, seed=seed, source=str(scene_name)
-        )
-        partial = path.with_name(f'{path.stem}.{os.getpid()}.npz')
-        prior.save(partial)
-        partial.replace(path)  # atomic: another process sees all of it or nothing
-    return path
-
-
-def map_cache() -> Path:
-    """`$XDG_CACHE_HOME/continuum_loc/maps`, by default under `~/.cache`."""
-    return (
-        Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'continuum_loc' / 'maps'
-    )
-
-
 def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[str, int]:
     """
     Record samples into a new bag folder; how many of each topic.
@@ -229,19 +198,3 @@ def write_bag(path: Path, samples: Iterator[Measurement | TruthSample]) -> dict[
         shutil.rmtree(path, ignore_errors=True)
         raise
     return counts
-
-
-def configuration(trial: Trial, **more: Any) -> dict[str, Any]:
-    """Everything that a trial was made from, for its run folder; `more` adds to it."""
-    return {
-        'robot': load_robot(trial.robot),
-        'scene': trial.scene,
-        'trajectory': trial.trajectory,
-        'map': {'scene': trial.map_scene or trial.scene, 'points': MAP_POINTS},
-        'profile': trial.profile,
-        'tof_fidelity': trial.fidelity,
-        'disturbed': trial.disturbed,
-        'seed': trial.seed,
-        'duration': trial.duration,
-        **more,
-    }

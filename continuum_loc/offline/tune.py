@@ -15,10 +15,11 @@ from typing import Any
 from continuum_loc.errors import TuneError
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.map_files import load_map
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.parallel import parallel
 from continuum_loc.offline.replay import replay
 from continuum_loc.offline.runs import summary_of
-from continuum_loc.offline.trials import make_filter, Trial
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 import numpy as np

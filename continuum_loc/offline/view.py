@@ -87,11 +87,7 @@ def swept_box(result: ReplayResult, reach: float) -> tuple[np.ndarray, np.ndarra
 
 
 def recent_points(cloud: Cloud, stamp: int, most: int) -> np.ndarray:
-    """
-    Every n-th of the ToF points placed in the half second before `stamp`.
-
-    n leaves at most `most` (M, 3).
-    """
+    """ToF points (M, 3) placed in the half second before `stamp`, thinned to `most` at most."""
     recent = cloud.points[(cloud.stamps > stamp - CLOUD_SPAN) & (cloud.stamps <= stamp)]
     return recent[:: max(1, -(-len(recent) // most))]
 
@@ -125,11 +121,7 @@ def surroundings(
     most_faces: int,
     most_points: int,
 ) -> Surroundings:
-    """
-    Cut the part of the scene's mesh (vertices, faces) and of the prior map in the `swept_box`.
-
-    Both are thinned to the given numbers.
-    """
+    """Cut mesh (vertices, faces) and map points inside the `swept_box`, thinned as given."""
     low, high = swept_box(result, reach)
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), int)
     if mesh is not None:

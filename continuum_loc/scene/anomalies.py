@@ -1,7 +1,5 @@
 """
-What differs between the prior map and what was measured (paper, VI-C.4, eq. 12).
-
-New things, and missing ones.
+New and missing things: where measurements differ from the prior map (paper, VI-C.4, eq. 12).
 
 A *new* point is one whose squared Mahalanobis distance to the nearest map point exceeds tau. A map
 point stands for
@@ -210,7 +208,7 @@ def detect_anomalies(
     `index`: of `prior`, if there is one already.
     """
     settings = settings or AnomalySettings()
-    index = index or prior.index(reach=0.05)
+    index = index or prior.index
     beams = Beams.of(reconstruction)
     missing = clusters(missing_evidence(beams, prior, settings, index), 'missing', settings)
     behind = behind_map(beams, prior, index, len(reconstruction.points))

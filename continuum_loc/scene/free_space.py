@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.grid import AXIS_BITS, find_slot, pack
+from continuum_loc.mapping.grid import AXIS_BITS, find, hash_table
 from continuum_loc.scene.splat_cast import next_cell, start_march
-from numba import njit
 import numpy as np
 
 
@@ -19,8 +19,9 @@ def passes(
     """
     Count the beams that run through each cell, all of it, within their length.
 
-    cells: (C, 3) whole numbers, each once: the cell's corner in units of `edge` [m]. origins (N,
-    3) [m], directions (N, 3) unit, lengths (N,) [m]. Returns (C,).
+    cells: (C, 3) whole numbers, each once: the cell's corner in units of `edge` [m]. origins,
+    directions: (N, 3) [m], unit; lengths: (N,) [m]. Returns (C,). Raises MapError where the cells
+    are too small to be counted across the scene.
     """
     counts = np.zeros(len(cells), np.int64)
     if len(cells) == 0:
@@ -31,29 +32,19 @@ def passes(
         raise MapError(
             f'cells of {edge} m are too small for a scene {edge * extent.max():.3g} m across'
         )
-    slots = np.full((1 << int(np.ceil(np.log2(4 * len(cells)))), 2), -1, np.int64)
-    _insert(slots, np.ascontiguousarray(cells - corner, np.int64))
+    slots = hash_table(cells - corner)
     beams = (np.ascontiguousarray(part, np.float64) for part in (origins, directions, lengths))
     _count(slots, edge * corner.astype(np.float64), extent, edge, *beams, counts)
     return counts
 
 
-@njit(cache=True)
-def _insert(slots, cells):
-    for c in range(cells.shape[0]):
-        key = pack(cells[c, 0], cells[c, 1], cells[c, 2])
-        row = find_slot(slots, key, slots.shape[0] - 1)
-        slots[row, 0], slots[row, 1] = key, c
-
-
-@njit(cache=True)
+@kernel
 def _count(slots, corner, extent, edge, origins, directions, lengths, counts):
     for ray in range(origins.shape[0]):
         at, step, until, stride = start_march(origins[ray], directions[ray], corner, edge)
         while until.min() < lengths[ray]:  # the cell ends within the beam
             if 0 <= at[0] < extent[0] and 0 <= at[1] < extent[1] and 0 <= at[2] < extent[2]:
-                key = pack(at[0], at[1], at[2])
-                row = find_slot(slots, key, slots.shape[0] - 1)
-                if slots[row, 0] == key:
-                    counts[slots[row, 1]] += 1
+                cell = find(slots, at[0], at[1], at[2])
+                if cell >= 0:
+                    counts[cell] += 1
             next_cell(at, step, until, stride)

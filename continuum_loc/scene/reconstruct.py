@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from continuum_loc import lie
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
 from continuum_loc.mapping.ply import write_ply
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from continuum_loc.robot import RobotDescription
 from continuum_loc.trajectory import Trajectory
-from numba import njit
 import numpy as np
 
 CHUNK = 50_000  # points whose covariances are computed at a time
@@ -238,7 +238,7 @@ def _on_body(points, trajectory, stamps, distance, samples=8):
     return on
 
 
-@njit(cache=True)
+@kernel
 def _within(points, polyline, distance):
     """(F, Z) whether points (F, Z, 3) are within `distance` of their polyline (F, K, 3)."""
     out = np.zeros(points.shape[:2], np.bool_)
@@ -254,7 +254,7 @@ def _within(points, polyline, distance):
     return out
 
 
-@njit(cache=True)
+@kernel
 def _segment_distance2(p, a, b):
     along, span, total = 0.0, 0.0, 0.0
     for axis in range(3):

@@ -6,13 +6,28 @@ Each map point is taken as a small disc on its tangent plane.
 
 from __future__ import annotations
 
-from continuum_loc.mapping.grid import find_slot, pack, span_bounds
+from typing import NamedTuple
+
+from continuum_loc.compiling import kernel
+from continuum_loc.mapping.grid import find
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import VoxelIndex
-from numba import njit
 import numpy as np
 
 COVER = 1.25  # spacings: 99.9 % of a sampled surface lies nearer than this to a sample
+
+
+class Discs(NamedTuple):
+    """
+    How map points are taken: their radius [m], and which count.
+
+    Those count whose normal n has -(n . d) >= min_cosine for a ray's direction d; its absolute
+    value, where normals are not oriented.
+    """
+
+    radius: float
+    min_cosine: float
+    oriented: bool
 
 
 def first_crossings(
@@ -38,64 +53,65 @@ def first_crossings(
     rays = (
         np.ascontiguousarray(part, dtype=np.float64) for part in (origins, directions, lengths)
     )
-    _cast(
-        index.arrays,
-        prior.normals,
-        *rays,
-        float(radius),
-        float(min_cos),
-        prior.oriented,
-        rows,
-        depths,
-    )
+    discs = Discs(float(radius), float(min_cos), bool(prior.oriented))
+    _cast(index.arrays, discs, *rays, rows, depths)
     return rows, depths
 
 
-@njit(cache=True)
-def _cast(arrays, normals, origins, directions, lengths, radius, min_cos, oriented, rows, depths):
+@kernel
+def _cast(arrays, discs, origins, directions, lengths, rows, depths):
     for ray in range(origins.shape[0]):
         rows[ray], depths[ray] = _first_crossing(
-            arrays, normals, origins[ray], directions[ray], lengths[ray], radius, min_cos, oriented
+            arrays, discs, origins[ray], directions[ray], lengths[ray]
         )
 
 
-@njit(cache=True)
-def _first_crossing(arrays, normals, origin, direction, length, radius, min_cos, oriented):
+@kernel
+def _first_crossing(arrays, discs, origin, direction, length):
     """
     March through the index's blocks until the next one lies beyond the best crossing.
 
     A disc is looked for in the block of its centre only. One that reaches from a neighbouring
-    block, through which
-    the ray does not run, is not seen: a share of about radius / block edge of the surface has
-    thinner cover.
+    block, through which the ray does not run, is not seen: a share of about radius / block edge of
+    the surface has thinner cover.
     """
-    lattice = arrays.lattice
-    edge, corner = lattice.block, (lattice.x0, lattice.y0, lattice.z0)
-    extent = (lattice.blocks_x, lattice.blocks_y, lattice.blocks_z)
-    at, step, until, stride = start_march(origin, direction, corner, edge)
-    best, depth, entered = -1, length, 0.0
+    lattice, begins = arrays.lattice, arrays.begins
+    nx, ny, nz = lattice.extent
+    at, step, until, stride = start_march(origin, direction, lattice.corner, lattice.edge)
+    best, depth, entered = np.int64(-1), length, 0.0
     while entered <= depth:
-        if 0 <= at[0] < extent[0] and 0 <= at[1] < extent[1] and 0 <= at[2] < extent[2]:
-            key = pack(at[0], at[1], at[2])
-            row = find_slot(arrays.block_slots, key, arrays.block_slots.shape[0] - 1)
-            if arrays.block_slots[row, 0] == key:
-                best, depth = _cross_block(
-                    arrays,
-                    arrays.block_slots[row, 1],
-                    normals,
-                    origin,
-                    direction,
-                    radius,
-                    min_cos,
-                    oriented,
-                    best,
-                    depth,
-                )
+        if 0 <= at[0] < nx and 0 <= at[1] < ny and 0 <= at[2] < nz:
+            block = find(arrays.slots, at[0], at[1], at[2])
+            if block >= 0:
+                points = range(begins[block], begins[block + 1])
+                best, depth = _cross(arrays, discs, points, origin, direction, best, depth)
         entered = next_cell(at, step, until, stride)
     return best, (depth if best >= 0 else np.inf)
 
 
-@njit(cache=True)
+@kernel
+def _cross(arrays, discs, block, origin, direction, best, depth):
+    """Improve (row, depth) by the discs of a block, a range of sorted points."""
+    points, normals = arrays.points, arrays.normals
+    for p in block:
+        toward = -(
+            normals[p, 0] * direction[0]
+            + normals[p, 1] * direction[1]
+            + normals[p, 2] * direction[2]
+        )
+        if (toward if discs.oriented else abs(toward)) < discs.min_cosine:
+            continue
+        ox, oy, oz = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
+        t = -(normals[p, 0] * ox + normals[p, 1] * oy + normals[p, 2] * oz) / toward
+        if t <= 0.0 or t >= depth:
+            continue
+        ex, ey, ez = ox - t * direction[0], oy - t * direction[1], oz - t * direction[2]
+        if ex * ex + ey * ey + ez * ez < discs.radius * discs.radius:
+            best, depth = arrays.rows[p], t
+    return best, depth
+
+
+@kernel
 def start_march(origin, direction, corner, edge):
     """
     Start a march through cells of `edge` [m] counted from `corner` (Amanatides and Woo, 1987).
@@ -116,7 +132,7 @@ def start_march(origin, direction, corner, edge):
     return at, step, until, stride
 
 
-@njit(cache=True)
+@kernel
 def next_cell(at, step, until, stride):
     """Move a march (`start_march`) to its next cell; return how far along the ray it begins."""
     axis = int(np.argmin(until))
@@ -124,27 +140,3 @@ def next_cell(at, step, until, stride):
     until[axis] += stride[axis]
     at[axis] += step[axis]
     return entered
-
-
-@njit(cache=True)
-def _cross_block(arrays, span, normals, origin, direction, radius, min_cos, oriented, best, depth):
-    """Improve (row, depth) by the discs of the block with this span."""
-    points = arrays.points
-    first, after = span_bounds(span)
-    for p in range(first, after):
-        row = int(points[p, 3])
-        toward = -(
-            normals[row, 0] * direction[0]
-            + normals[row, 1] * direction[1]
-            + normals[row, 2] * direction[2]
-        )
-        if (toward if oriented else abs(toward)) < min_cos:
-            continue
-        ox, oy, oz = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
-        t = -(normals[row, 0] * ox + normals[row, 1] * oy + normals[row, 2] * oz) / toward
-        if t <= 0.0 or t >= depth:
-            continue
-        ex, ey, ez = ox - t * direction[0], oy - t * direction[1], oz - t * direction[2]
-        if ex * ex + ey * ey + ez * ez < radius * radius:
-            best, depth = row, t
-    return best, depth

@@ -1,7 +1,5 @@
 """
-All modules at once.
-
-One smooth, inextensible backbone that explains every field and every attitude.
+All modules at once: one smooth, inextensible backbone that explains every field and attitude.
 
 The backbone is a chain of arcs of constant twist and curvature, `PIECES` from each module to the
 next, so that arclengths hold exactly and neighbours share what they know. Against solving eq. 10
@@ -16,15 +14,36 @@ is held by the others.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from continuum_loc import lie_kernels
-from continuum_loc.magnet import evaluate_field, FieldModel, magnet_parameters
+from continuum_loc.compiling import kernel
+from continuum_loc.magnet import field_error, FieldModel, magnet_parameters, MagnetParameters
 from continuum_loc.robot import RobotDescription
-from numba import njit
 import numpy as np
 
 MAX_ITERATIONS = 50
 PIECES = 3
+
+
+class Rod(NamedTuple):
+    """What is known before any reading: the chain of N arcs, its priors, and the magnet."""
+
+    lengths: np.ndarray  # (N,) of the arcs [m]
+    rest: np.ndarray  # (3,) strain without load [1/m]
+    prior: np.ndarray  # (3 N, 3 N) information of the strains [m^2]
+    magnet: MagnetParameters
+    magnet_s: float  # arclength of the magnet's centre [m]
+
+
+class Readings(NamedTuple):
+    """What M modules read; the fields in their own frames."""
+
+    field: np.ndarray  # (M, 3) [T]
+    weight: np.ndarray  # (M, 3) of its components [1/T^2]; 0 drops one
+    earth: np.ndarray  # (3,) in the base frame [T]
+    R_base_module: np.ndarray  # (M, 3, 3)
+    information: np.ndarray  # (M, 3, 3) of the rotations [1/rad^2]; zeros drop one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,9 +51,9 @@ class BackboneFit:
     """
     The joint fit of all modules.
 
-    T_base_module (M, 4, 4); covariance (M, 6, 6) of a right perturbation [rho; phi]; strain (N,
-    3): twist and the two curvatures of the N = PIECES * M arcs [1/m]; cost: half the sum of
-    squares; dimension: of the measurements in it; converged.
+    T_base_module: (M, 4, 4). covariance: (M, 6, 6) of a right perturbation [rho; phi].
+    strain: (N, 3) twist and the two curvatures [1/m] of the N = PIECES * M arcs.
+    cost: half the sum of squares. dimension: how many measurements it sums over.
     """
 
     T_base_module: np.ndarray
@@ -60,27 +79,26 @@ class BackboneSolver:
         model: FieldModel = 'ring',
         step_sigma: float = 15.0,
     ) -> None:
-        """
-        Set how much the curvature changes from one module to the next.
-
-        step_sigma: 1 sigma of the change [1/m].
-        """
+        """step_sigma: how much the curvature changes between neighbours, 1 sigma [1/m]."""
         gaps = np.diff(np.asarray(arclengths, float), prepend=0.0)
-        self.lengths = np.repeat(gaps / PIECES, PIECES)
-        self.parameters = magnet_parameters(robot.magnet, model)
-        self.magnet_s = robot.magnet.s
-        self.rest = np.array(robot.backbone.rest_strain[3:])
+        lengths = np.repeat(gaps / PIECES, PIECES)
         sigma = np.array(robot.backbone.rest_strain_sigma[3:])
-        # The prior on the strain (its mean from module to module) and on the curvature's walk from
-        # arc to arc.
-        count = len(self.lengths)
+        # The mean strain between two modules is near the rest strain, and the curvature walks
+        # from arc to arc.
+        count = len(lengths)
         step = np.diff(np.eye(count), axis=0)
         walk = PIECES / step_sigma**2
         weights = [
             np.kron(np.eye(count), np.diag(sigma**-2.0)) / PIECES,
             np.kron(step.T @ step, np.diag([0.0, walk, walk])),
         ]
-        self.prior = np.ascontiguousarray(sum(weights))
+        self.rod = Rod(
+            lengths,
+            np.array(robot.backbone.rest_strain[3:]),
+            np.ascontiguousarray(sum(weights)),
+            magnet_parameters(robot.magnet, model),
+            robot.magnet.s,
+        )
 
     def solve(
         self,
@@ -89,91 +107,44 @@ class BackboneSolver:
         earth: np.ndarray,
         R_base_module: np.ndarray,
         information: np.ndarray,
-        start: np.ndarray | None = None,
+        iterations: int = MAX_ITERATIONS,
     ) -> BackboneFit:
         """
         Fit to the fields in the modules' frames and to their attitudes.
 
-        field (M, 3) [T] with sigma (M, 3) (inf drops a component), the Earth's field (3,) [T] in
-        the base frame, and attitudes R_base_module (M, 3, 3) with information (M, 3, 3) [1/rad^2]
-        in the modules' frames (zeros drop one). start: strain (N, 3) of an earlier fit.
+        The arguments are those of `Readings`, with field_sigma (M, 3) [T] for the weights: inf
+        drops a component. iterations: at most so many.
         """
-        strain = (
-            np.tile(self.rest, (len(self.lengths), 1))
-            if start is None
-            else np.array(start, dtype=float)
-        )
         weight = 1.0 / np.asarray(field_sigma, float) ** 2
-        measured = np.where(weight > 0.0, field, 0.0)
-        known = (
-            measured,
+        readings = Readings(
+            np.where(weight > 0.0, field, 0.0),
             weight,
             np.asarray(earth, float),
             np.ascontiguousarray(R_base_module),
             np.ascontiguousarray(information),
         )
-        T, chain, H, cost, converged = _solve(
-            strain, self.lengths, self.parameters, self.magnet_s, self.rest, self.prior, *known
-        )
+        strain = np.tile(self.rod.rest, (len(self.rod.lengths), 1))
+        T, chain, H, cost, converged = _solve(strain, self.rod, readings, iterations)
         # The posterior of the strains, carried along the chain to every module.
         covariance = chain @ np.linalg.solve(H, chain.swapaxes(1, 2))
         dimension = int((weight > 0.0).sum() + np.linalg.matrix_rank(information).sum())
         return BackboneFit(T, covariance, strain, cost, dimension, converged)
 
 
-@njit(cache=True)
-def _solve(
-    strain,
-    lengths,
-    parameters,
-    magnet_s,
-    rest,
-    prior,
-    field,
-    weight,
-    earth,
-    R_measured,
-    information,
-):
+@kernel
+def _solve(strain, rod, readings, iterations):
     """Levenberg-Marquardt on `strain` (N, 3), in place."""
-    count = 3 * lengths.size
-    T, chain = _forward(strain, lengths)
-    H, slope, cost = _normal(
-        T,
-        chain,
-        strain,
-        parameters,
-        magnet_s,
-        rest,
-        prior,
-        field,
-        weight,
-        earth,
-        R_measured,
-        information,
-    )
+    T, chain = _forward(strain, rod.lengths)
+    H, slope, cost = _normal(T, chain, strain, rod, readings)
     damping, converged = 1e-6, False
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(iterations):
         damped = H.copy()
-        for i in range(count):
+        for i in range(slope.size):
             damped[i, i] *= 1.0 + damping
         step = -np.linalg.solve(damped, slope)
         trial = strain + step.reshape(strain.shape)
-        T_trial, chain_trial = _forward(trial, lengths)
-        H_trial, slope_trial, cost_trial = _normal(
-            T_trial,
-            chain_trial,
-            trial,
-            parameters,
-            magnet_s,
-            rest,
-            prior,
-            field,
-            weight,
-            earth,
-            R_measured,
-            information,
-        )
+        T_trial, chain_trial = _forward(trial, rod.lengths)
+        H_trial, slope_trial, cost_trial = _normal(T_trial, chain_trial, trial, rod, readings)
         promised = -0.5 * (slope * step).sum()
         if cost_trial <= cost:
             strain[:] = trial
@@ -187,13 +158,9 @@ def _solve(
     return T, chain, H, cost, converged
 
 
-@njit(cache=True)
+@kernel
 def _forward(strain, lengths):
-    """
-    T_base_module (M, 4, 4), and its right-perturbation Jacobian by all strains.
-
-    The Jacobian is chain (M, 6, 3 N).
-    """
+    """Give T_base_module (M, 4, 4) and its right-perturbation Jacobian (M, 6, 3 N) by strain."""
     arcs = lengths.size
     T = np.zeros((arcs, 4, 4))
     chain = np.zeros((arcs, 6, 3 * arcs))
@@ -220,77 +187,37 @@ def _forward(strain, lengths):
     return T[first::PIECES].copy(), chain[first::PIECES].copy()
 
 
-@njit(cache=True)
-def _normal(
-    T,
-    chain,
-    strain,
-    parameters,
-    magnet_s,
-    rest,
-    prior,
-    field,
-    weight,
-    earth,
-    R_measured,
-    information,
-):
+@kernel
+def _normal(T, chain, strain, rod, readings):
     """Gauss-Newton matrix, gradient and cost of the whole fit."""
-    departure = (strain - rest).ravel()
-    H = prior.copy()
-    slope = prior @ departure
+    departure = (strain - rod.rest).ravel()
+    H = rod.prior.copy()
+    slope = rod.prior @ departure
     cost = 0.5 * (departure * slope).sum()
     J = np.empty((3, 6))
     residual = np.empty(3)
     for m in range(T.shape[0]):
-        field_error(T[m], parameters, magnet_s, earth, field[m], residual, J)
+        p = T[m, :3, 3].copy()
+        p[0] -= rod.magnet_s
+        field_error(rod.magnet, T[m, :3, :3], p, readings.earth, readings.field[m], residual, J)
         rows = J @ chain[m]
         for i in range(3):
-            if weight[m, i] > 0.0:
-                cost += 0.5 * weight[m, i] * residual[i] ** 2
-                slope += weight[m, i] * residual[i] * rows[i]
-                H += weight[m, i] * np.outer(rows[i], rows[i])
-        turn = rotation_difference(R_measured[m], T[m])
+            weight = readings.weight[m, i]
+            if weight > 0.0:
+                cost += 0.5 * weight * residual[i] ** 2
+                slope += weight * residual[i] * rows[i]
+                H += weight * np.outer(rows[i], rows[i])
+        turn = _rotation_difference(readings.R_base_module[m], T[m])
         rows = np.ascontiguousarray(chain[m, 3:])
-        pull = information[m] @ turn
+        pull = readings.information[m] @ turn
         cost += 0.5 * (turn * pull).sum()
         slope += rows.T @ pull
-        H += rows.T @ (information[m] @ rows)
+        H += rows.T @ (readings.information[m] @ rows)
     return H, slope, cost
 
 
-@njit(cache=True)
-def field_error(T_base_module, parameters, magnet_s, earth, measured, residual, J):
-    """
-    Residual (3,) = R^T (B(p) + earth) - measured [T], and its Jacobian J (3, 6).
-
-    By a right perturbation [rho; phi].
-    """
-    R = T_base_module[:3, :3]
-    p = T_base_module[:3, 3].copy()
-    p[0] -= magnet_s
-    source, gradient = np.empty(3), np.empty((3, 3))
-    evaluate_field(parameters, p, source, gradient)
-    h = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            h[i] += R[j, i] * (source[j] + earth[j])
-    for i in range(3):
-        residual[i] = h[i] - measured[i]
-        for j in range(3):
-            total = 0.0
-            for k in range(3):
-                for n in range(3):
-                    total += R[k, i] * gradient[k, n] * R[n, j]
-            J[i, j] = total
-    # d(R^T w) = [h]x phi
-    J[0, 3], J[0, 4], J[0, 5] = 0.0, -h[2], h[1]
-    J[1, 3], J[1, 4], J[1, 5] = h[2], 0.0, -h[0]
-    J[2, 3], J[2, 4], J[2, 5] = -h[1], h[0], 0.0
-
-
-@njit(cache=True)
-def rotation_difference(R_measured, T):
+@kernel
+def _rotation_difference(R_measured, T):
     """(3,) Log(R_measured^T R)."""
     D = np.zeros((4, 4))
     D[3, 3] = 1.0

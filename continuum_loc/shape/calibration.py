@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
+from typing import NamedTuple
 
 from continuum_loc import lie
 from continuum_loc.errors import CalibrationError, SettingsError
@@ -129,6 +130,30 @@ def module_mounts(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
+class ModuleMounts(NamedTuple):
+    """A calibration as the estimator uses it, one row a module: rotations and offsets."""
+
+    R_module_imu: np.ndarray  # (M, 3, 3)
+    accel_offset: np.ndarray  # (M, 3) [m/s^2]
+    R_module_hall: np.ndarray  # (M, 3, 3)
+    hall_offset: np.ndarray  # (M, 3) [T]
+
+
+def calibrated_mounts(robot: RobotDescription, calibration: Calibration) -> ModuleMounts:
+    """Turn the mounts of the robot description by a calibration's corrections."""
+    imu_mount, hall_mount = module_mounts(robot)
+    accel_offset, imu_turn, hall_offset, hall_turn = (
+        np.array([getattr(module, name) for module in calibration.modules])
+        for name in ('accel_offset', 'imu_turn', 'hall_offset', 'hall_turn')
+    )
+    return ModuleMounts(
+        imu_mount @ lie.so3_exp(imu_turn),
+        accel_offset,
+        hall_mount @ lie.so3_exp(hall_turn),
+        hall_offset,
+    )
+
+
 def straight_modules(robot: RobotDescription) -> np.ndarray:
     """(M, 4, 4) T_base_module of the straight robot."""
     T = np.tile(np.eye(4), (len(robot.hall), 1, 1))
@@ -175,11 +200,7 @@ def check_wiring(robot: RobotDescription, posed: PosedRest, model: FieldModel = 
         raise CalibrationError(
             f'saturated at rest: {", ".join(saturated)}; choose a coarser RES or GAIN'
         )
-    _, hall = module_mounts(robot)
-    source = field_and_gradient(
-        robot.magnet, _from_magnet(robot, posed.T_base_module[:, :3, 3]), model
-    )[0]
-    expected = np.einsum('mji,mj->mi', posed.T_base_module[:, :3, :3] @ hall, source)
+    expected = expected_field(robot, posed.T_base_module, model)
     order = best_assignment(posed.rest.field, expected)
     agreement = np.einsum('mi,mi->m', posed.rest.field[order], expected)
     if (agreement < 0.0).all():
@@ -196,19 +217,26 @@ def check_wiring(robot: RobotDescription, posed: PosedRest, model: FieldModel = 
         raise CalibrationError(f'modules are swapped: {"; ".join(wrong)}')
 
 
-def best_assignment(field: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """
-    (M,) order such that field[order] fits `expected` (M, 3) best by magnitude.
+def expected_field(
+    robot: RobotDescription, T_base_module: np.ndarray, model: FieldModel = 'ring'
+) -> np.ndarray:
+    """(M, 3) field [T] of the magnet in the Hall sensors' frames, as described."""
+    _, hall = module_mounts(robot)
+    source = _source(robot, T_base_module[:, :3, 3], model)
+    return np.einsum('mji,mj->mi', T_base_module[:, :3, :3] @ hall, source)
 
-    Few modules: all are tried.
-    """
+
+def best_assignment(field: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """(M,) order, of all there are, such that field[order] fits `expected` (M, 3) in magnitude."""
     measured, wanted = (np.log(np.linalg.norm(b, axis=1) + 1e-9) for b in (field, expected))
     orders = np.array(list(permutations(range(len(field)))))
     return orders[np.argmin(((measured[orders] - wanted) ** 2).sum(axis=1))]
 
 
-def _from_magnet(robot: RobotDescription, p_base: np.ndarray) -> np.ndarray:
-    return p_base - np.array([robot.magnet.s, 0.0, 0.0])
+def _source(robot: RobotDescription, p_base: np.ndarray, model: FieldModel) -> np.ndarray:
+    """(..., 3) field of the magnet [T] at p_base (..., 3) [m], both in the base frame."""
+    p = p_base - np.array([robot.magnet.s, 0.0, 0.0])
+    return field_and_gradient(robot.magnet, p, model)[0]
 
 
 class _Problem:
@@ -235,9 +263,7 @@ class _Problem:
         R_map_base = np.stack([posed.T_map_base[:3, :3] for posed in rests])
         T_base_module = np.stack([posed.T_base_module for posed in rests])
         self.R_map_module = R_map_base[:, None] @ T_base_module[:, :, :3, :3]
-        source = field_and_gradient(
-            robot.magnet, _from_magnet(robot, T_base_module[:, :, :3, 3]), model
-        )[0]
+        source = _source(robot, T_base_module[:, :, :3, 3], model)
         self.source = np.einsum('kij,kmj->kmi', R_map_base, source)  # in map
         self.gyro = np.mean([posed.rest.gyro for posed in rests], axis=0)
         self.accel = np.stack([posed.rest.accel for posed in rests])

@@ -1,13 +1,10 @@
 """
-Curves through the magnet and the modules: the paper's three (eqs. 11-24), each in two forms.
+Curves through the magnet and the modules: the paper's three (eqs. 11-24), in space.
 
-All take `points` (N, 3) [m] from the magnet on, and unit `tangents` (N, 3) there, in a frame whose
-x is the magnet's axis, and give points (samples, 3) of the curve in that frame.
-
-The *projected* forms are the paper's: points and tangents go to the (r, axis) half plane (eq. 12),
-the curve is fitted there and turned back by one mean direction (eqs. 23-24). With r >= 0 an
-S-shape folds over, and bending out of a plane is lost. The *spatial* forms work on the points as
-they are and hold for both. A straight robot is a line in either.
+All take `points` (N, 3) [m] from the magnet on and unit `tangents` (N, 3) there, and give points
+(samples, 3) of the curve in the same frame. The paper projects them into a half plane first
+(eq. 12), where an S-shape folds over and a bend out of its plane is lost. These forms work on the
+points as they are. A straight robot is a line.
 """
 
 from __future__ import annotations
@@ -15,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from numba import njit
+from continuum_loc.compiling import kernel
+from continuum_loc.errors import InputError
 import numpy as np
 
 CurveMethod = Literal['quadratic_bezier', 'cubic_bezier', 'kasa_arc']
-PARALLEL = 1e-6  # sine of the angle below which two tangents count as parallel
 STRAIGHT = 1e-5  # sagitta over chord below which an arc is drawn as its line
 ARC_TOLERANCE = 1.5e-4  # m rms: points farther from their circle are no single arc
 
@@ -28,13 +25,15 @@ def fit_curve(
     points: np.ndarray,
     tangents: np.ndarray,
     method: CurveMethod = 'kasa_arc',
-    projected: bool = False,
     samples: int = 61,
 ) -> np.ndarray:
-    """Fit (samples, 3) points along the curve of the named method, from first to last point."""
-    forms = PROJECTED if projected else SPATIAL
-    if method not in forms:
-        raise ValueError(f"no curve '{method}'; valid: {', '.join(forms)}")
+    """
+    Fit (samples, 3) points along the curve of the named method, from first to last point.
+
+    Raises InputError for an unknown method, and for points that the method cannot join.
+    """
+    if method not in CURVES:
+        raise InputError(f"no curve '{method}'; valid: {', '.join(CURVES)}")
     points, tangents = np.asarray(points, float), np.asarray(tangents, float)
     if (
         points.ndim != 2
@@ -42,77 +41,18 @@ def fit_curve(
         or points.shape != tangents.shape
         or len(points) < 3
     ):
-        raise ValueError(
+        raise InputError(
             f'expected points and tangents (N >= 3, 3), got {points.shape} and {tangents.shape}'
         )
-    return forms[method](points, tangents, samples)
-
-
-# The paper's projected forms
-
-
-def project(vectors: np.ndarray) -> np.ndarray:
-    """(N, 2) distance from the axis and position along it, eq. 12."""
-    return np.column_stack([np.hypot(vectors[:, 1], vectors[:, 2]), vectors[:, 0]])
-
-
-def lift(planar: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """
-    (C, 3) curve points in space from the half plane (C, 2), eqs. 23-24.
-
-    Summed over the points there are.
-    """
-    total = np.hypot(points[:, 1], points[:, 2]).sum()
-    wy, wz = points[:, 1:].sum(axis=0) / total if total > 0.0 else (1.0, 0.0)
-    return np.column_stack([planar[:, 1], wy * planar[:, 0], wz * planar[:, 0]])
-
-
-def projected_quadratic_bezier(
-    points: np.ndarray, tangents: np.ndarray, samples: int
-) -> np.ndarray:
-    """
-    Eqs. 11-14.
-
-    The control point is where neighbouring tangents meet; a chord where they do not meet between.
-
-    The sign of the printed kappa (eq. 14) is the opposite of the intersection's and is mended
-    here.
-    """
-    p, n = project(points), project(tangents)
-    chord = np.diff(p, axis=0)
-    denominator = cross(n[:-1], n[1:])
-    with np.errstate(divide='ignore', invalid='ignore'):
-        kappa = cross(chord, n[1:]) / denominator
-    length = np.linalg.norm(chord, axis=1)
-    meets = (np.abs(denominator) > PARALLEL) & (kappa > 0.0) & (kappa < 2.0 * length)
-    control = np.where(
-        meets[:, None],
-        p[:-1] + np.where(meets, kappa, 0.0)[:, None] * n[:-1],
-        p[:-1] + 0.5 * chord,
-    )
-    return lift(quadratic_chain(p[:-1], control, p[1:], samples), points)
-
-
-def projected_cubic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """Eqs. 15-16."""
-    return lift(cubic_bezier(project(points), None, samples), points)
-
-
-def projected_kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """Eqs. 17-22."""
-    planar = project(points)
-    return lift(_arc_or_line(planar, kasa_circle(planar), samples), points)
-
-
-# The same in space
+    return CURVES[method](points, tangents, samples)
 
 
 def quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
     """
     Two quadratic pieces from each point to the next, which keep both tangents.
 
-    Tangents in space do not meet in general, and on an S-shape not between the points, so one
-    piece cannot keep both; two can always, with the control polygon of the biarc.
+    One piece cannot: tangents in space do not meet in general, nor between the points of an
+    S-shape. Two always can, with the control polygon of the biarc.
     """
     start, middle, end, first, second = _biarc_polygon(points, tangents)
     return quadratic_chain(
@@ -123,7 +63,7 @@ def quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> 
 def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) -> np.ndarray:
     """One cubic through four points at t = 0, 1/3, 2/3, 1 (eqs. 15-16 hold in any dimension)."""
     if len(points) != 4:
-        raise ValueError(f'a cubic Bezier passes through exactly 4 points, got {len(points)}')
+        raise InputError(f'a cubic Bezier passes through exactly 4 points, got {len(points)}')
     inner = np.array([1.0 / 3.0, 2.0 / 3.0])
     basis = _bernstein(inner)
     controls = np.linalg.solve(basis[:, 1:3], points[1:3] - basis[:, [0, 3]] @ points[[0, 3]])
@@ -132,11 +72,9 @@ def cubic_bezier(points: np.ndarray, tangents: np.ndarray | None, samples: int) 
 
 def kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
     """
-    Fit a circle of least squares, or a chain of biarcs.
+    Kasa's circle in the plane of least squares (SVD), where one arc explains the points.
 
-    The circle lies in the plane of least squares (SVD), where one arc explains the points; else a
-    chain of biarcs through points and tangents, which is still arcs, but as many as an S-shape
-    needs.
+    Elsewhere it is a chain of biarcs through points and tangents.
     """
     centre = points.mean(axis=0)
     _, size, axes = np.linalg.svd(points - centre, full_matrices=False)
@@ -145,7 +83,7 @@ def kasa_arc(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarr
     radial = size[1:2] if fit is None else np.hypot(*(planar - fit[:2]).T) - fit[2]
     if (radial @ radial + size[2] ** 2) / len(points) > ARC_TOLERANCE**2:
         return biarc_chain(points, tangents, samples)
-    return centre + _arc_or_line(planar, fit, samples) @ axes[:2]
+    return centre + arc_or_line(planar, fit, samples) @ axes[:2]
 
 
 def biarc_chain(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
@@ -173,12 +111,7 @@ def biarc_chain(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.nd
 
 
 Fit = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-PROJECTED: dict[str, Fit] = {
-    'quadratic_bezier': projected_quadratic_bezier,
-    'cubic_bezier': projected_cubic_bezier,
-    'kasa_arc': projected_kasa_arc,
-}
-SPATIAL: dict[str, Fit] = {
+CURVES: dict[str, Fit] = {
     'quadratic_bezier': quadratic_bezier,
     'cubic_bezier': cubic_bezier,
     'kasa_arc': kasa_arc,
@@ -192,10 +125,8 @@ def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
     """
     (3,) centre and radius of the Kasa least-squares circle of (N, 2) points, eqs. 17-20.
 
-    None when straight.
-
-    About the points' mean, eq. 20 falls apart into a 2x2 system for the centre and sigma =
-    mean(x^2 + y^2).
+    Gives None for points on a line. About the points' mean, eq. 20 falls apart into a 2x2 system
+    for the centre and sigma = mean(x^2 + y^2). Raises InputError where all points coincide.
     """
     mean = planar.mean(axis=0)
     q = planar - mean
@@ -204,7 +135,7 @@ def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     spread = S[0, 0] + S[1, 1]
     if spread == 0.0:
-        raise ValueError('all points of the curve coincide')
+        raise InputError('all points of the curve coincide')
     if determinant < 1e-16 * spread**2:
         return None
     half = 0.5 * (q.T @ square)
@@ -218,11 +149,11 @@ def kasa_circle(planar: np.ndarray) -> np.ndarray | None:
     return np.array([*(mean + centre), radius])
 
 
-def _arc_or_line(planar: np.ndarray, circle: np.ndarray | None, samples: int) -> np.ndarray:
+def arc_or_line(planar: np.ndarray, circle: np.ndarray | None, samples: int) -> np.ndarray:
     """
-    Walk (samples, 2) points along the Kasa circle, eqs. 21-22.
+    Walk (samples, 2) points along the Kasa circle, or along the line where there is none.
 
-    From the first point's polar angle to the last's.
+    They run from the first point's polar angle to the last one's, eqs. 21-22.
     """
     t = np.linspace(0.0, 1.0, samples)[:, None]
     if circle is None:
@@ -244,9 +175,8 @@ def _biarc_polygon(points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray
     """
     Start, joint, end and the two inner control points of each biarc, (N - 1, 3) each.
 
-    A biarc joins two neighbours.
-
-    Both arms have the length d for which the middle arm of the polygon is 2 d long.
+    A biarc joins two neighbours. Both of its arms have the length d for which the middle arm of
+    the polygon is 2 d long.
     """
     start, end, t0, t1 = points[:-1], points[1:], tangents[:-1], tangents[1:]
     chord = end - start
@@ -285,14 +215,10 @@ def _bernstein(t: np.ndarray) -> np.ndarray:
     return np.stack([(1 - t) ** 3, 3 * (1 - t) ** 2 * t, 3 * (1 - t) * t**2, t**3], axis=-1)
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
 # What is done with a curve
 
 
-@njit(cache=True)
+@kernel
 def arclength(points: np.ndarray) -> np.ndarray:
     """(C,) length along the polyline [m]."""
     s = np.zeros(len(points))
@@ -301,15 +227,7 @@ def arclength(points: np.ndarray) -> np.ndarray:
     return s
 
 
-def at_fractions(points: np.ndarray, fractions: np.ndarray) -> np.ndarray:
-    """(F, 3) points at fractions (F,) of the curve's length."""
-    s = arclength(points)
-    return np.column_stack(
-        [np.interp(np.asarray(fractions) * s[-1], s, column) for column in points.T]
-    )
-
-
-@njit(cache=True)
+@kernel
 def _cross3(a, b):
     """Compute a x b; NumPy's own takes seconds to compile."""
     return np.array(
@@ -317,13 +235,9 @@ def _cross3(a, b):
     )
 
 
-@njit(cache=True)
+@kernel
 def extended(points: np.ndarray, length: float) -> np.ndarray:
-    """
-    Carry the curve on to `length` [m] with the curvature of its last tenth.
-
-    It stays as it is when that long already.
-    """
+    """Carry a curve that is shorter than `length` [m] on with the curvature of its last tenth."""
     s = arclength(points)
     missing = length - s[-1]
     if missing <= 1e-9:

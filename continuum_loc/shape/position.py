@@ -1,7 +1,5 @@
 """
-Where a module is, from the field it measures.
-
-The paper's bounded least squares (eq. 10), compiled.
+Where a module is, from the field it measures: the paper's bounded least squares (eq. 10).
 
     min |b - B(p)|^2   subject to   lower <= p <= upper,
 
@@ -16,6 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
+from continuum_loc.compiling import kernel
+from continuum_loc.errors import MeasurementError
 from continuum_loc.magnet import (
     evaluate_field,
     field_and_gradient,
@@ -25,7 +25,6 @@ from continuum_loc.magnet import (
     magnet_parameters,
 )
 from continuum_loc.robot import Magnet
-from numba import njit
 import numpy as np
 
 MAX_ITERATIONS = 60
@@ -38,23 +37,16 @@ class PositionFit:
     """
     Positions of M modules in the magnet's frame.
 
-    position: (M, 3) m. residual: (M,) |b - B(p)| in T. bound: (M, 3) int, -1 on the lower bound, 1
-    on the upper, 0 inside. converged: (M,) whether the first-order (KKT) conditions hold: the
-    gradient is zero on every free axis and points out of the box on every bound axis. ambiguous:
-    (M,) another optimum fits as well.
+    position: (M, 3) [m]. bound: (M, 3) int, -1 on the lower bound, 1 on the upper, 0 inside.
+    converged: (M,) whether the first-order (KKT) conditions hold: the gradient is zero on every
+    free axis and points out of the box on every bound axis.
+    ambiguous: (M,) whether another optimum fits as well.
     """
 
     position: np.ndarray
-    residual: np.ndarray
     bound: np.ndarray
     converged: np.ndarray
     ambiguous: np.ndarray
-    iterations: np.ndarray
-
-    @property
-    def interior(self) -> np.ndarray:
-        """(M,) whether the optimum lies inside the bounds on every axis."""
-        return ~self.bound.any(axis=-1)
 
 
 class PositionSolver:
@@ -83,14 +75,15 @@ class PositionSolver:
         """
         Positions from `field` (M, 3) [T] in the magnet's frame.
 
-        start: (M, 3) prior positions [m], by default the closed-form inverse of the dipole. Raises
-        ValueError
-        for a field that is not finite: a saturated module has no position of its own.
+        start: (M, 3) prior positions [m], by default the closed-form inverse of the dipole.
+        Raises MeasurementError for a field that is not finite: a saturated module has no position
+        of its own.
         """
         field = np.ascontiguousarray(field, dtype=float)
         if field.shape != self.lower.shape or not np.isfinite(field).all():
-            raise ValueError(
-                f'expected a finite field of shape {self.lower.shape}, got {field.tolist()}'
+            raise MeasurementError(
+                'saturated',
+                f'expected a finite field of shape {self.lower.shape}, got {field.tolist()}',
             )
         prior = (
             invert_dipole(self.magnet, field)
@@ -113,33 +106,30 @@ class PositionSolver:
         """
         (M, 6, 6) covariance of position and attitude errors, and observability (M,).
 
-        In the magnet's frame.
-
-        sigma: white noise of the field [T]; attitude (M, 3, 3): covariance of the module's
-        rotation error phi in the magnet's frame [rad^2], which turns the measured field: db = phi
-        x b. The prior that a module lies within its arclength (one sigma of half of it) keeps the
-        result finite where the field says nothing; `observable` is whether the field narrows that
-        prior at least fivefold in every direction.
+        Both are in the magnet's frame. sigma: white noise of the field [T]. attitude: (M, 3, 3)
+        covariance [rad^2] of the module's rotation error phi, which turns the measured field by
+        db = phi x b. The prior that a module lies within its arclength (one sigma is half of it)
+        keeps the result finite where the field says nothing. A position is observable where the
+        field narrows that prior at least fivefold in every direction.
         """
-        prior_sigma = 0.5 * self.arclengths
         return _covariance(
             self.parameters,
             np.ascontiguousarray(position),
             np.ascontiguousarray(field),
             sigma**2,
             np.ascontiguousarray(attitude),
-            prior_sigma,
+            0.5 * self.arclengths,
         )
 
 
-@njit(cache=True)
-def _covariance(parameters, position, field, variance, attitude, prior_sigma):
+@kernel
+def _covariance(magnet, position, field, variance, attitude, prior_sigma):
     modules = len(position)
     covariance = np.empty((modules, 6, 6))
     observable = np.empty(modules, np.bool_)
     source, gradient, turn = np.empty(3), np.empty((3, 3)), np.zeros((3, 3))
     for m in range(modules):
-        evaluate_field(parameters, position[m], source, gradient)
+        evaluate_field(magnet, position[m], source, gradient)
         b = field[m]
         turn[0, 1], turn[0, 2], turn[1, 2] = b[2], -b[1], b[0]  # db = phi x b
         turn[1, 0], turn[2, 0], turn[2, 1] = -b[2], b[1], -b[0]
@@ -153,71 +143,67 @@ def _covariance(parameters, position, field, variance, attitude, prior_sigma):
     return covariance, observable
 
 
-@njit(cache=True)
-def _solve_all(parameters, fields, prior, lower, upper):
-    """
-    From the prior first.
-
-    Where that is no exact fit, also from the dipole's closed form and its mirror image.
-    """
+@kernel
+def _solve_all(magnet, fields, prior, lower, upper):
+    """Position (M, 3), bound (M, 3), converged (M,) and ambiguous (M,) of all modules."""
     modules = fields.shape[0]
     position = np.empty((modules, 3))
-    residual = np.empty(modules)
     bound = np.zeros((modules, 3), np.int64)
     converged = np.zeros(modules, np.bool_)
     ambiguous = np.zeros(modules, np.bool_)
-    iterations = np.zeros(modules, np.int64)
     for m in range(modules):
-        best = math.inf
-        start = prior[m]
-        for k in range(3):
-            if k > 0:
-                start = invert_dipole_once(parameters[0], fields[m]) * (1.0 if k == 1 else -1.0)
-            p, cost, count, stationary = _solve_one(
-                parameters, fields[m], start, lower[m], upper[m]
-            )
-            iterations[m] += count
-            # An alternative replaces the prior's own optimum only by fitting clearly better.
-            apart = math.sqrt(((p - position[m]) ** 2).sum())
-            if k == 0 or cost < 0.25 * best - 1e-16:
-                ambiguous[m] = False
-                position[m] = p
-                best = cost
-                converged[m] = stationary
-            elif apart > SAME_OPTIMUM and cost <= 4.0 * best + 1e-16:
-                ambiguous[m] = True
-            if k == 0 and stationary and cost < 1e-16:
-                break  # an exact fit inside the box, where the field has one source position
-        residual[m] = math.sqrt(best) * math.sqrt((fields[m] ** 2).sum())
+        position[m], converged[m], ambiguous[m] = _solve_module(
+            magnet, fields[m], prior[m], lower[m], upper[m]
+        )
         for i in range(3):
             if position[m, i] <= lower[m, i]:
                 bound[m, i] = -1
             elif position[m, i] >= upper[m, i]:
                 bound[m, i] = 1
-    return position, residual, bound, converged, ambiguous, iterations
+    return position, bound, converged, ambiguous
 
 
-@njit(cache=True)
-def _solve_one(parameters, measured, start, lower, upper):
+@kernel
+def _solve_module(magnet, measured, prior, lower, upper):
+    """
+    Start from the prior, and then from the dipole's closed form and its mirror image.
+
+    An exact fit inside the box needs no further start: the field has one source position there.
+    """
+    position, best, converged = _solve_one(magnet, measured, prior, lower, upper)
+    ambiguous = False
+    if converged and best < 1e-16:
+        return position, converged, ambiguous
+    for side in (1.0, -1.0):
+        start = invert_dipole_once(magnet.dipole, measured) * side
+        p, cost, stationary = _solve_one(magnet, measured, start, lower, upper)
+        # An alternative replaces the prior's own optimum only by fitting clearly better.
+        if cost < 0.25 * best - 1e-16:
+            position, best, converged, ambiguous = p, cost, stationary, False
+        elif math.sqrt(((p - position) ** 2).sum()) > SAME_OPTIMUM and cost <= 4.0 * best + 1e-16:
+            ambiguous = True
+    return position, converged, ambiguous
+
+
+@kernel
+def _solve_one(magnet, measured, start, lower, upper):
     """Levenberg-Marquardt with an active set; the cost is |B(p) - b|^2 / |b|^2."""
     p = np.minimum(np.maximum(start, lower), upper)
     size = math.sqrt((measured**2).sum())
     field, trial_field = np.empty(3), np.empty(3)
     gradient, trial_gradient = np.empty((3, 3)), np.empty((3, 3))
-    evaluate_field(parameters, p, field, gradient)
+    evaluate_field(magnet, p, field, gradient)
     cost = _relative_cost(field, measured, size)
     damping = 1e-6
     stationary = False
-    count = 0
-    while count < MAX_ITERATIONS:
-        count += 1
+    for _ in range(MAX_ITERATIONS):
         step, reducible = _step(field, gradient, measured, size, p, lower, upper, damping)
         if reducible < 1e-24:
             stationary = True
             break
         trial = np.minimum(np.maximum(p + step, lower), upper)
         moved = math.sqrt(((trial - p) ** 2).sum())
-        evaluate_field(parameters, trial, trial_field, trial_gradient)
+        evaluate_field(magnet, trial, trial_field, trial_gradient)
         trial_cost = _relative_cost(trial_field, measured, size)
         if trial_cost <= cost:
             p = trial
@@ -233,10 +219,10 @@ def _solve_one(parameters, measured, start, lower, upper):
             if damping > 1e12:
                 stationary = moved < STEP_TOLERANCE
                 break
-    return p, cost, count, stationary
+    return p, cost, stationary
 
 
-@njit(cache=True)
+@kernel
 def _relative_cost(field, measured, size):
     total = 0.0
     for i in range(3):
@@ -244,13 +230,9 @@ def _relative_cost(field, measured, size):
     return total
 
 
-@njit(cache=True)
+@kernel
 def _step(field, gradient, measured, size, p, lower, upper, damping):
-    """
-    Damped Gauss-Newton step over the axes that are free to move.
-
-    And how much cost it could remove.
-    """
+    """Damped Gauss-Newton step of the axes that are free, and the cost that it could remove."""
     slope = np.zeros(3)
     H = np.zeros((3, 3))
     for i in range(3):
@@ -271,7 +253,7 @@ def _step(field, gradient, measured, size, p, lower, upper, damping):
     return step, -(slope * step).sum()
 
 
-@njit(cache=True)
+@kernel
 def _solve3(H, b):
     """Solve the symmetric positive 3x3 system H x = b by Cholesky, in place."""
     x = b.copy()

@@ -8,9 +8,9 @@ which have to agree in every channel (a constant turn shows in gravity and in th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from continuum_loc.errors import MotionError
+from continuum_loc.errors import CalibrationError, MotionError
 from continuum_loc.measurements import FieldSample, ImuSample
 from continuum_loc.robot import RobotDescription
 import numpy as np
@@ -28,27 +28,19 @@ class Rest:
     samples: int
 
 
-@dataclass(eq=False)
 class RestWindow:
-    """
-    Collects the samples of one rest.
+    """Collects the samples of one rest, by sensor; sensors that `robot` has not are ignored."""
 
-    Modules are numbered as the robot's `imu` and `hall` sensors.
-    """
-
-    robot: RobotDescription
-    _rows: dict[tuple[str, str], list[np.ndarray]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for kind, sensors in (
-            ('gyro', self.robot.imu),
-            ('accel', self.robot.imu),
-            ('field', self.robot.hall),
-        ):
-            self._rows |= {(kind, sensor.name): [] for sensor in sensors}
+    def __init__(self, robot: RobotDescription) -> None:
+        self._imu, self._hall = robot.imu_model, robot.hall_model
+        self._rows: dict[tuple[str, str], list[np.ndarray]] = {
+            (kind, sensor.name): []
+            for kind, sensors in (('gyro', robot.imu), ('accel', robot.imu), ('field', robot.hall))
+            for sensor in sensors
+        }
 
     def add(self, sample: ImuSample | FieldSample) -> None:
-        """Take one sample; sensors that the robot has not are ignored."""
+        """Take one sample."""
         if isinstance(sample, ImuSample):
             self._append('gyro', sample.sensor, sample.angular_velocity)
             self._append('accel', sample.sensor, sample.linear_acceleration)
@@ -59,54 +51,53 @@ class RestWindow:
         if (kind, name) in self._rows:
             self._rows[kind, name].append(reading)
 
-    @property
-    def fewest(self) -> int:
-        """Count the samples of the sensor that sent fewest."""
-        return min(len(rows) for rows in self._rows.values())
-
-    def silent(self) -> tuple[str, ...]:
-        """Sensors that sent nothing."""
-        return tuple(sorted({name for (_, name), rows in self._rows.items() if not rows}))
+    def readings(self, kind: str, name: str) -> np.ndarray:
+        """(N, 3) readings of one sensor's `gyro`, `accel` or `field`."""
+        return np.array(self._rows[kind, name])
 
     def finish(self) -> Rest:
-        """
-        Take the means.
+        """Take the means, of a robot that rested: what `means` and `check_motion` raise."""
+        rest = self.means()
+        self.check_motion()
+        return rest
 
-        Raises MotionError naming every sensor that moved, and ValueError for one that was silent.
-
-        A saturated channel is nan in the mean.
+    def means(self) -> Rest:
         """
-        if self.silent():
-            raise ValueError(f'no samples at rest from {", ".join(self.silent())}')
-        found = [
-            self._motion(kind, name, np.array(rows)) for (kind, name), rows in self._rows.items()
-        ]
-        if any(found):
-            raise MotionError('motion during taring: ' + '; '.join(filter(None, found)))
+        Average each sensor; a saturated channel is nan in its mean.
+
+        Raises CalibrationError naming the sensors that were silent.
+        """
+        silent = sorted({name for (_, name), rows in self._rows.items() if not rows})
+        if silent:
+            raise CalibrationError(f'no samples at rest from {", ".join(silent)}')
         means = {
             kind: np.array(
                 [np.mean(rows, axis=0) for (k, _), rows in self._rows.items() if k == kind]
             )
             for kind in ('gyro', 'accel', 'field')
         }
-        return Rest(**means, samples=self.fewest)
+        return Rest(**means, samples=min(len(rows) for rows in self._rows.values()))
 
-    def _motion(self, kind: str, name: str, rows: np.ndarray) -> str:
-        """Tell what moved in one sensor's readings (N, 3), or an empty text."""
-        imu, hall = self.robot.imu_model, self.robot.hall_model
+    def check_motion(self) -> None:
+        """Raise MotionError naming every sensor that moved."""
+        found = [text for kind, name in self._rows if (text := self.motion(kind, name))]
+        if found:
+            raise MotionError('motion during taring: ' + '; '.join(found))
+
+    def motion(self, kind: str, name: str) -> str:
+        """Tell what moved in one sensor's readings, or an empty text."""
         noise, unit, scale = {
-            'gyro': (imu.gyro_sigma, 'rad/s', 1.0),
-            'accel': (imu.accel_sigma, 'm/s^2', 1.0),
-            'field': (np.hypot(hall.sigma, max(hall.lsb) / 12**0.5), 'uT', 1e6),
+            'gyro': (self._imu.gyro_sigma, 'rad/s', 1.0),
+            'accel': (self._imu.accel_sigma, 'm/s^2', 1.0),
+            'field': (np.hypot(self._hall.sigma, max(self._hall.lsb) / 12**0.5), 'uT', 1e6),
         }[kind]
+        rows = self.readings(kind, name)
         half = len(rows) // 2
         drift = np.abs(rows[:half].mean(axis=0) - rows[-half:].mean(axis=0)).max() if half else 0.0
         spread = rows.std(axis=0).max()
         # The standard deviation of a standard deviation is sigma / sqrt(2 N).
-        widest, farthest = (
-            noise * (1.0 + GATE / np.sqrt(2.0 * len(rows))),
-            GATE * noise * np.sqrt(2.0 / max(half, 1)),
-        )
+        widest = noise * (1.0 + GATE / np.sqrt(2.0 * len(rows)))
+        farthest = GATE * noise * np.sqrt(2.0 / max(half, 1))
         if spread > widest or drift > farthest:
             return (
                 f'{name} {kind} spread {spread * scale:.3g} and drift {drift * scale:.3g} {unit} '

@@ -4,7 +4,14 @@ The simulated robot in its scene.
 `World` drives it and yields what its sensors measure, with the truth.
 """
 
-from continuum_loc.errors import SimulationDiverged
-from continuum_loc.simulator.world import World
+from importlib import import_module
 
-__all__ = ['SimulationDiverged', 'World']
+_HOMES = {'World': 'world'}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str):
+    """Load a module only when somebody asks for what it holds."""
+    if name not in _HOMES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)

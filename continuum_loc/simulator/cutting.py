@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from continuum_loc.compiling import kernel
 from continuum_loc.simulator.solids import mesh_of, solid_of, vertices_of
 from manifold3d import Manifold
-from numba import njit
 import numpy as np
 
 _TILE_FACES = 4000  # above this, a piece is halved without a look at its hull
@@ -169,7 +169,7 @@ def _planes(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
     return normal[sound] / twice_area[sound, None], ((a + b + c) / 3.0)[sound]
 
 
-@njit(cache=True)
+@kernel
 def _exits(normal, centre, outward, offset):
     """Distance (F,) from each centre along its normal to where it leaves the half-spaces."""
     exits = np.zeros(len(normal))
@@ -186,7 +186,7 @@ def _exits(normal, centre, outward, offset):
     return exits
 
 
-@njit(cache=True)
+@kernel
 def _all_near(triangles, faces, low, high, tolerance):
     """
     Tell whether triangles (T, 3, 3) lie within `tolerance` of faces (F, 3, 3).
@@ -213,7 +213,7 @@ def _all_near(triangles, faces, low, high, tolerance):
     return True
 
 
-@njit(cache=True)
+@kernel
 def _beside(triangle, low, high, tolerance):
     """Find the faces whose bounds are within `tolerance` of those of a triangle (3, 3)."""
     found = np.empty(len(low), np.int64)
@@ -230,7 +230,7 @@ def _beside(triangle, low, high, tolerance):
     return found[:count]
 
 
-@njit(cache=True)
+@kernel
 def _halve(stack, height, finest):
     """Divide the triangle at `height` along its longest edge, unless that is finest already."""
     longest, edge = 0.0, 0
@@ -252,7 +252,7 @@ def _halve(stack, height, finest):
     return True
 
 
-@njit(cache=True)
+@kernel
 def _corners_near(corners, faces, chosen, tolerance):
     """1 where all corners (3, 3) are near one chosen face, 0 where each is near some, else -1."""
     limit = tolerance * tolerance
@@ -267,7 +267,7 @@ def _corners_near(corners, faces, chosen, tolerance):
     return 0 if first and second and third else -1
 
 
-@njit(cache=True)
+@kernel
 def _to_triangle(point, face):
     """Squared distance of a point (3,) from a triangle (3, 3)."""
     bb = bc = cc = pb = pc = pp = 0.0
@@ -291,7 +291,7 @@ def _to_triangle(point, face):
     return max(min(ab, ac, over), 0.0)
 
 
-@njit(cache=True)
+@kernel
 def _saved(along, length):
     """Give what a move along an edge takes from a squared distance; along: its dot product."""
     share = min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0

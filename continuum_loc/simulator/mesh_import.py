@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from continuum_loc.errors import SceneError
-from continuum_loc.simulator import convex, cutting
+from continuum_loc.errors import MapError, SceneError
+from continuum_loc.mapping.formats.shapes import Cloud
+from continuum_loc.mapping.map_files import read_shape
 from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scene_cache import cached_scene
@@ -17,6 +18,10 @@ import numpy as np
 
 _SMALLEST, _LARGEST = 0.05, 50.0  # a continuum robot's surroundings, longest edge [m]
 _REFLECTANCE = 0.5
+_EXPORT = (
+    'export a triangle mesh, not points or curves, and name the file by what it is (.stl, .obj, '
+    '.ply)'
+)
 _WALL = 0.05  # thickness given to a room that is modelled by its inner surface alone [m]
 
 
@@ -31,8 +36,9 @@ def import_mesh(path: Path) -> Scene:
     """
     mesh = _load(path)
     check_mesh(mesh.vertices, mesh.faces, str(path))
-    made_from = [path, Path(__file__), Path(convex.__file__), Path(cutting.__file__)]
-    return cached_scene(path.stem, made_from, lambda: _scene(path, mesh.vertices, mesh.faces))
+    return cached_scene(
+        path.stem, __name__, lambda: _scene(path, mesh.vertices, mesh.faces), made_from=[path]
+    )
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
@@ -42,10 +48,7 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     It needs a credible size, no degenerate faces and no holes, and an orientation.
     """
     if len(faces) == 0:
-        raise SceneError(
-            f'{where}: no faces; export a triangle mesh, not points or curves, and name the file '
-            'by what it is (.stl, .obj, .ply)'
-        )
+        raise SceneError(f'{where}: no faces; {_EXPORT}')
     if not np.all(np.isfinite(vertices)):
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise SceneError(
@@ -59,16 +62,15 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
 def _load(path: Path):
     import trimesh
 
-    if not path.is_file():
-        raise SceneError(
-            f'{path}: {"a folder, not a mesh file" * path.is_dir() or "no such file"}'
-        )
-    if path.stat().st_size == 0:
-        raise SceneError(f'{path}: the file is empty; export the mesh again')
+    if path.is_dir():
+        raise SceneError(f'{path}: a folder, not a mesh file')
     try:
-        mesh = trimesh.load(path, force='mesh', process=False)
-    except Exception as error:  # the parsers raise whatever they stumble on
-        raise SceneError(f'{path}: cannot be read as {path.suffix[1:].upper()}: {error}') from None
+        read = read_shape(path)
+    except MapError as error:
+        raise SceneError(str(error)) from None
+    if isinstance(read, Cloud):
+        raise SceneError(f'{path}: no faces; {_EXPORT}')
+    mesh = trimesh.Trimesh(read.vertices, read.faces, process=False)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # STL repeats vertices per face
     return mesh
 

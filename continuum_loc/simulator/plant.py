@@ -12,7 +12,7 @@ from pathlib import Path
 
 from continuum_loc.errors import SettingsError
 from continuum_loc.robot import RobotDescription
-from continuum_loc.settings import load_bundled, Settings
+from continuum_loc.settings import load_bundled, Name, Settings
 import numpy as np
 from pydantic import Field, model_validator
 
@@ -72,7 +72,7 @@ class PlantSettings(Settings):
         (20e-6, 0.0, -45e-6), description="Earth's field in map [T]"
     )
     tendons: tuple[TendonSet, ...] = ()
-    profiles: dict[str, Profile] = Field(min_length=1)
+    profiles: dict[Name, Profile] = Field(min_length=1)
 
     @model_validator(mode='after')
     def _consistent(self) -> PlantSettings:

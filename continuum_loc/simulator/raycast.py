@@ -6,8 +6,8 @@ The scene by Embree (through Open3D), the robot's own body as capsules by a comp
 
 from __future__ import annotations
 
+from continuum_loc.compiling import kernel
 from continuum_loc.simulator.scene import Scene
-from numba import njit
 import numpy as np
 
 _INSIDE_RAYS = 5  # odd
@@ -54,7 +54,7 @@ class RayCaster:
         return found.numpy().astype(float)
 
 
-@njit(cache=True)
+@kernel
 def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndarray) -> np.ndarray:
     """
     Distance (S, K) along the K unit rays of S fans to the first of M capsules.
@@ -97,7 +97,7 @@ def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndar
     return nearest
 
 
-@njit(cache=True)
+@kernel
 def _enclosing_cone(directions):
     """Axis (3,) and half angle of a cone round a fan's rays."""
     axis = np.zeros(3)
@@ -110,7 +110,7 @@ def _enclosing_cone(directions):
     return axis, np.arccos(max(-1.0, cosine))
 
 
-@njit(cache=True)
+@kernel
 def _outside_cone(cone_axis, half_angle, axis, offset, radius):
     """
     Tell where a capsule's bounding ball is clear of the fan's cone.
@@ -131,7 +131,7 @@ def _outside_cone(cone_axis, half_angle, axis, offset, radius):
 # ray's direction.
 
 
-@njit(cache=True)
+@kernel
 def _capsule_entry(vv, vw, ww, vd, wd, radius):
     """Distance at which a ray from outside enters a capsule, inf if it does not."""
     quadratic = vv - vd * vd
@@ -146,7 +146,7 @@ def _capsule_entry(vv, vw, ww, vd, wd, radius):
     return min(_ball_entry(ww, wd, radius), _ball_entry(ww - 2.0 * vw + vv, wd - vd, radius))
 
 
-@njit(cache=True)
+@kernel
 def _ball_entry(ww, wd, radius):
     discriminant = wd * wd - ww + radius * radius
     if discriminant < 0.0:
@@ -155,13 +155,13 @@ def _ball_entry(ww, wd, radius):
     return distance if distance > 0.0 else np.inf
 
 
-@njit(cache=True)
+@kernel
 def _inside(vv, vw, ww, radius):
     """Tell where the origin lies within the capsule."""
     station = min(max(vw / vv, 0.0), 1.0) if vv > 0.0 else 0.0
     return ww - 2.0 * station * vw + station * station * vv <= radius * radius
 
 
-@njit(cache=True)
+@kernel
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

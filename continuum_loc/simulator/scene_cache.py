@@ -1,8 +1,8 @@
 """
 Built scenes on disk, so that a scene which takes seconds to make is made once.
 
-An entry's name holds a digest of everything that it was made from (the generators' source among
-it): a changed generator never meets an old entry.
+An entry's name holds a digest of everything that it was made from, the generator's code and what
+that imports among it: a changed generator never meets an old entry.
 """
 
 from __future__ import annotations
@@ -12,34 +12,34 @@ from contextlib import suppress
 import hashlib
 import os
 from pathlib import Path
-from zipfile import BadZipFile
 
+from continuum_loc.caches import cache_folder
+from continuum_loc.closure import digest_of_code
+from continuum_loc.npz_files import read_arrays
 from continuum_loc.simulator.scene import Anomaly, Scene
 import numpy as np
 
+KIND = 'scenes'
 
-def cached_scene(name: str, made_from: Iterable[Path], build: Callable[[], Scene]) -> Scene:
+
+def cached_scene(
+    name: str, generator: str, build: Callable[[], Scene], made_from: Iterable[Path] = ()
+) -> Scene:
     """
     Take the scene `name` from the cache, or build it and put it there.
 
-    `made_from`: files whose content decides the scene.
+    generator: name of the module that builds it. made_from: files whose content decides it too.
     """
-    digest = hashlib.sha256()
-    for path in sorted(made_from):
+    digest = hashlib.sha256(digest_of_code(generator, __name__, presets=False).encode())
+    for path in made_from:
         digest.update(path.read_bytes())
-    entry = cache_folder() / f'{name}-{digest.hexdigest()[:16]}.npz'
+    entry = cache_folder(KIND) / f'{name}-{digest.hexdigest()[:16]}.npz'
     try:
         return _read(entry)
-    except (OSError, KeyError, ValueError, BadZipFile):
+    except (OSError, KeyError, ValueError):
         scene = build()  # absent, or cut short by a crash
     _write(scene, entry)
     return scene
-
-
-def cache_folder() -> Path:
-    """`$XDG_CACHE_HOME/continuum_loc`, by default `~/.cache/continuum_loc`."""
-    home = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
-    return Path(home) / 'continuum_loc' / 'scenes'
 
 
 def _write(scene: Scene, entry: Path) -> None:
@@ -66,27 +66,27 @@ def _write(scene: Scene, entry: Path) -> None:
 
 
 def _read(entry: Path) -> Scene:
-    with np.load(entry) as data:
-        anomalies = zip(
-            data['anomaly_names'],
-            data['anomaly_kinds'],
-            _unpack(data, 'anomaly_vertices'),
-            _unpack(data, 'anomaly_faces'),
-            strict=True,
-        )
-        return Scene(
-            str(data['name']),
-            data['vertices'],
-            data['faces'],
-            data['face_object'],
-            tuple(map(str, data['objects'])),
-            data['reflectance'],
-            tuple(_unpack(data, 'hulls')),
-            tuple(
-                Anomaly(str(name), str(kind), vertices, faces)
-                for name, kind, vertices, faces in anomalies
-            ),
-        )
+    data = read_arrays(entry)
+    anomalies = zip(
+        data['anomaly_names'],
+        data['anomaly_kinds'],
+        _unpack(data, 'anomaly_vertices'),
+        _unpack(data, 'anomaly_faces'),
+        strict=True,
+    )
+    return Scene(
+        str(data['name']),
+        data['vertices'],
+        data['faces'],
+        data['face_object'],
+        tuple(map(str, data['objects'])),
+        data['reflectance'],
+        tuple(_unpack(data, 'hulls')),
+        tuple(
+            Anomaly(str(name), str(kind), vertices, faces)
+            for name, kind, vertices, faces in anomalies
+        ),
+    )
 
 
 def _pack(
@@ -101,6 +101,6 @@ def _pack(
     }
 
 
-def _unpack(data: np.lib.npyio.NpzFile, name: str) -> list[np.ndarray]:
+def _unpack(data: dict[str, np.ndarray], name: str) -> list[np.ndarray]:
     ends = data[f'{name}_ends']
     return np.split(data[name], ends[:-1]) if len(ends) else []

@@ -44,21 +44,11 @@ def load_scene(name_or_path: str | Path) -> Scene:
 
 @lru_cache(maxsize=4)
 def _built(name: str) -> Scene:
-    from continuum_loc.simulator import (
-        box,
-        engine_mesh,
-        engine_variants,
-        scene,
-        scene_cache,
-        solids,
-    )
+    from continuum_loc.simulator import box, engine_variants
+    from continuum_loc.simulator.scene_cache import cached_scene
 
     if name in BOX_SCENES:
         return box.box_scene(name)
-    sources = (
-        Path(module.__file__)
-        for module in (scene, engine_mesh, engine_variants, solids, scene_cache)
-    )
-    return scene_cache.cached_scene(
-        name, [Path(__file__), *sources], lambda: engine_variants.engine_variant(name)
+    return cached_scene(
+        name, engine_variants.__name__, lambda: engine_variants.engine_variant(name)
     )

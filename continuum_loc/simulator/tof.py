@@ -20,7 +20,7 @@ import numpy as np
 if TYPE_CHECKING:
     from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
 
-TOF_TOO_CLOSE = 4  # the driver reports a consistency failure there
+TOF_TOO_CLOSE = 4  # a consistency failure
 Fidelity = Literal['paper', 'vl53l5cx']
 
 # The body's black plastic, and the mean cosine at which rays meet a cylinder seen broadside.
@@ -42,11 +42,17 @@ class Echoes:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Per sensor and zone (S, Z), as in `TofFrame`: ranges [m], stated sigma [m], status."""
+    """
+    Per sensor and zone (S, Z), as in `TofFrame`: ranges [m], stated sigma [m], status.
+
+    raw: (S, Z) distance in the driver's registers [m], where the receiver has such; no frame
+    carries it.
+    """
 
     ranges: np.ndarray
     sigma: np.ndarray
     status: np.ndarray
+    raw: np.ndarray | None = None
 
 
 class Receiver(Protocol):
@@ -94,12 +100,7 @@ class TofSensorModel:
         body_capsules: (M, 7), the robot's body as `cast_capsules` wants it; None leaves the body
         out of view.
         """
-        if np.shape(T_map_sensors) != (len(names), 4, 4):
-            raise ValueError(
-                f'sensor poses {np.shape(T_map_sensors)} do not fit {len(names)} names'
-            )
-        echoes = self._cast(np.asarray(T_map_sensors, dtype=float), body_capsules)
-        readings = self._receiver.read(echoes, names, self._rng)
+        readings = self.read(T_map_sensors, names, body_capsules)
         finite = np.isfinite(readings.ranges)[..., None]
         points = np.where(finite, readings.ranges[..., None] * self._zones, np.nan)
         return [
@@ -108,6 +109,20 @@ class TofSensorModel:
             )
             for i, name in enumerate(names)
         ]
+
+    def read(
+        self,
+        T_map_sensors: np.ndarray,
+        names: Sequence[str],
+        body_capsules: np.ndarray | None = None,
+    ) -> Readings:
+        """Read every sensor once, before frames are made of it; arguments as of `measure`."""
+        if np.shape(T_map_sensors) != (len(names), 4, 4):
+            raise ValueError(
+                f'sensor poses {np.shape(T_map_sensors)} do not fit {len(names)} names'
+            )
+        echoes = self._cast(np.asarray(T_map_sensors, dtype=float), body_capsules)
+        return self._receiver.read(echoes, names, self._rng)
 
     def _cast(self, T_map_sensors: np.ndarray, body_capsules: np.ndarray | None) -> Echoes:
         rays = self._receiver.directions @ T_map_sensors[:, :3, :3].transpose(0, 2, 1)

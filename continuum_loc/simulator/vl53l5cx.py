@@ -19,48 +19,138 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from continuum_loc.compiling import kernel
 from continuum_loc.measurements import TOF_NO_TARGET, TOF_VALID
 from continuum_loc.robot import TofModel
 from continuum_loc.settings import Settings
-from continuum_loc.simulator.tof import Echoes, Readings, TOF_TOO_CLOSE
-from numba import njit
+from continuum_loc.simulator.tof import Echoes, Readings
+from continuum_loc.simulator.vl53l5cx_unit import Units
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-# Target status of the driver (see also measurements.py).
-STATUS_FAINT, STATUS_FIRST, STATUS_WIDE_PULSE, STATUS_NEW_TARGET = 4, 6, 9, 10
-STATUS_BLURRED, STATUS_INCONSISTENT = 12, 13
-_MEASURED = (TOF_VALID, STATUS_FIRST, STATUS_WIDE_PULSE, STATUS_NEW_TARGET)
+# Target status of the driver (see also measurements.py). Public flights in a room never show 6, 12
+# or 13: a recording begins while the sensor ranges already, and what the sharpener takes out
+# leaves no target.
+STATUS_STRAY, STATUS_FAINT, STATUS_WIDE_PULSE, STATUS_NEW_TARGET = 2, 4, 9, 10
+STATUS_INCONSISTENT = 13
+_MEASURED = (TOF_VALID, STATUS_WIDE_PULSE)
 
 _MILLIMETRE = 1e-3
+_FORGETS = 0.05  # share of the way to 1 m that a distance in the registers goes each frame
+# Daylight [klux] that doubles the square of the threshold. Of the datasheet's reach on white, 4 m
+# in the dark and 1.4 m at 5 klux: (4 / 1.4)^4 = 1 + 5 / 0.076.
+AMBIENT_UNIT = 0.076
 
 
 class Vl53l5cxSettings(Settings):
-    """How the sensor departs from ideal."""
+    """
+    How the sensor departs from ideal.
+
+    Where a number comes from: `flights`, chosen so that `continuum-loc evaluate flights` finds in
+    a simulated room what public flights show (first half of their list); `datasheet`, DS13754;
+    `publication`, the characterisation by Caroleo, Albini and Maiolino, which reports that there
+    is such an effect.
+    """
 
     sub_rays: int = Field(4, ge=1, le=16, description='sub-rays along each side of a zone')
     target_order: Literal['strongest', 'closest'] = 'strongest'
-    pulse_width: float = Field(0.15, gt=0.0, description='depth within which returns merge [m]')
-    threshold: float = Field(0.055, gt=0.0, description='least signal that makes a target')
-    fluctuation: float = Field(0.1, ge=0.0, description='relative noise of the signal (1 sigma)')
+    pulse_width: float = Field(
+        0.35,
+        gt=0.0,
+        description='depth within which returns merge [m] (flights; 0.6 m by the manual)',
+    )
+    threshold: float = Field(
+        0.055, gt=0.0, description='least signal that makes a target in the dark (datasheet)'
+    )
+    ambient: float = Field(
+        0.04, ge=0.0, description='ambient light, as daylight of so many klux (flights)'
+    )
+    fluctuation: float = Field(
+        0.5, ge=0.0, description='relative fading of the signal, 1 sigma (flights)'
+    )
+    persistence: float = Field(
+        0.7, ge=0.0, lt=1.0, description='correlation of the fading from frame to frame (flights)'
+    )
     crosstalk: float = Field(
         0.01, ge=0.0, lt=1.0, description="share of a zone's light that reaches each neighbour"
     )
-    noise_floor: float = Field(0.002, ge=0.0, description='noise beside Table I [m]')
+    noise_distance: tuple[float, ...] = Field(
+        (0.1, 0.45, 0.8, 1.25, 2.33, 4.0), description='distances of `noise` [m]'
+    )
+    noise: tuple[float, ...] = Field(
+        (0.0015, 0.0016, 0.0032, 0.0050, 0.0085, 0.0160),
+        description='core of the noise of a bright target, 1 sigma [m] (flights)',
+    )
+    faint_noise: float = Field(
+        3.0, ge=0.0, description='variance that a target hardly seen has besides (flights)'
+    )
+    tail: float = Field(
+        0.16, ge=0.0, le=1.0, description='share in the tails, of targets hardly seen (flights)'
+    )
+    tail_size: float = Field(
+        5.0, ge=0.0, description='sigma of these, in sigmas of Table I (flights)'
+    )
     wide_pulse: float = Field(
-        0.03, gt=0.0, description='spread of depth in a zone that earns status 9 [m]'
+        0.072, gt=0.0, description='spread of depth in a zone that earns status 9 [m] (flights)'
+    )
+    range_offset: float = Field(
+        0.008, ge=0.0, description='offset per unit, 1 sigma [m] (datasheet: within 15 mm)'
+    )
+    range_scale: float = Field(
+        0.015, ge=0.0, description='scale per unit, 1 sigma (datasheet: within 5 %; publication)'
+    )
+    warm_up: float = Field(
+        0.004, ge=0.0, description='drift while warming up, 1 sigma over units [m] (publication)'
+    )
+    warm_up_time: float = Field(
+        60.0, gt=0.0, description='time constant of the warming [s] (an assumption)'
+    )
+    pattern: float = Field(
+        0.0013, ge=0.0, description='fixed offsets of zones, 1 sigma [m] (flights)'
+    )
+    near: float = Field(0.04, ge=0.0, description='a target nearer than this may be none [m]')
+    blind: float = Field(
+        0.7, ge=0.0, le=1.0, description='share of zones to which such a target is none (flights)'
     )
     dropout: float = Field(
-        0.002, ge=0.0, le=1.0, description='probability that a zone reports no target'
+        0.003, ge=0.0, le=1.0, description='probability that a zone misses its target (flights)'
     )
-    inconsistent: float = Field(0.001, ge=0.0, le=1.0, description='probability of status 13')
+    new_target: float = Field(
+        0.75, ge=0.0, le=1.0, description='probability that a target come anew is status 10'
+    )
+    faint: float = Field(
+        0.027, ge=0.0, le=1.0, description='status 4 per zone without a target (flights)'
+    )
+    stray: float = Field(
+        0.008, ge=0.0, le=1.0, description='status 2 begins, per zone without a target (flights)'
+    )
+    stray_stays: float = Field(
+        0.36, ge=0.0, le=1.0, description='probability that status 2 goes on (flights)'
+    )
+    inconsistent: float = Field(0.0, ge=0.0, le=1.0, description='probability of status 13')
+
+    @model_validator(mode='after')
+    def _consistent(self) -> Vl53l5cxSettings:
+        if len(self.noise_distance) != len(self.noise) or min(self.noise, default=0.0) <= 0.0:
+            raise ValueError(
+                'noise_distance and noise must have one value each per row, all greater than 0, '
+                f'got {len(self.noise_distance)} and {len(self.noise)}'
+            )
+        if list(self.noise_distance) != sorted(set(self.noise_distance)):
+            raise ValueError(f'noise_distance must increase, got {list(self.noise_distance)}')
+        return self
+
+    @property
+    def lit_threshold(self) -> float:
+        """Least signal that makes a target in the ambient light: it has to beat its shot noise."""
+        return self.threshold * float(np.sqrt(1.0 + self.ambient / AMBIENT_UNIT))
 
 
 class Vl53l5cxReceiver:
     """
     Turns sub-ray echoes into readings.
 
-    It remembers which zones had a target in the frame before (status 10).
+    It keeps what each unit has of its own and remembers (`vl53l5cx_unit.Units`).
     """
 
     def __init__(self, tof_model: TofModel, settings: Vl53l5cxSettings | None = None) -> None:
@@ -68,26 +158,53 @@ class Vl53l5cxReceiver:
         self._zone_cosine = tof_model.directions[:, 0]
         self._sub_directions = _sub_directions(tof_model, self._settings.sub_rays)
         self.directions = self._sub_directions.reshape(-1, 3)
-        self._had_target: dict[str, np.ndarray] = {}
+        self._units: dict[str, Units] = {}
 
     def read(self, echoes: Echoes, names: Sequence[str], rng: np.random.Generator) -> Readings:
         """Turn echoes (S, Z * sub_rays^2) into readings (S, Z)."""
+        settings, units = self._settings, self._recall(names, rng)
         depth, signal, spread = self._own_targets(echoes)
-        depth, signal, blurred = self._leak(depth, signal)
-        sigma = self._sigma(depth, signal, spread)
-        normal, uniform = rng.standard_normal((2, *depth.shape)), rng.random(depth.shape)
-        signal = signal * (1.0 + self._settings.fluctuation * normal[1])
-        depth = np.round((depth + sigma * normal[0]) / _MILLIMETRE) * _MILLIMETRE
-        status = self._status(depth, signal, spread, blurred, uniform, self._memory(names))
-        self._had_target.update(zip(names, status != TOF_NO_TARGET, strict=True))
+        depth, signal = self._leak(depth, signal)
+        normal, uniform = rng.standard_normal((3, *depth.shape)), rng.random((6, *depth.shape))
+        sigma, faintness = self._sigma(depth, signal, spread), self._faintness(signal)
+        tail = uniform[0] < settings.tail * faintness
+        error = np.where(tail, settings.tail_size * self._model.sigma(depth), sigma) * normal[0]
+        seconds = units.frames / self._model.rate
+        raw = _whole(units.biased(depth, seconds, settings.warm_up_time) + error)
+        units.fade(settings.persistence, normal[1])
+        signal = signal * np.exp(settings.fluctuation * units.fading)
+        status = self._status(depth, signal, spread, uniform, units)
+        raw = np.where(
+            (status == TOF_NO_TARGET) & ((depth <= 0.0) | (depth >= settings.near)),
+            np.maximum(0.0, _whole(units.register + error)),
+            raw,
+        )
+        raw = _registered(raw, status, units, uniform[5])
+        self._remember(names, units, status, raw)
         measured = np.isin(status, _MEASURED)
         ranges = np.select(
-            [measured, status == TOF_NO_TARGET, depth < self._model.min_range],
-            [depth / self._zone_cosine, np.inf, -np.inf],
+            [status == TOF_NO_TARGET, measured & (raw < self._model.min_range), measured],
+            [np.inf, -np.inf, raw / self._zone_cosine],
             np.nan,
         )
         stated = np.maximum(np.round(sigma / _MILLIMETRE), 1.0) * _MILLIMETRE / self._zone_cosine
-        return Readings(ranges, np.where(measured, stated, np.nan), status)
+        return Readings(ranges, np.where(np.isfinite(ranges), stated, np.nan), status, raw)
+
+    def _recall(self, names: Sequence[str], rng: np.random.Generator) -> Units:
+        for name in names:
+            if name not in self._units:
+                self._units[name] = Units.drawn(1, len(self._zone_cosine), self._settings, rng)
+        return Units.together([self._units[name] for name in names])
+
+    def _remember(
+        self, names: Sequence[str], units: Units, status: np.ndarray, raw: np.ndarray
+    ) -> None:
+        units.seen = np.isin(status, (*_MEASURED, STATUS_NEW_TARGET))
+        units.stray = status == STATUS_STRAY
+        units.register = np.where(units.seen, raw, units.register)
+        units.forget(_FORGETS)
+        units.frames = units.frames + 1
+        self._units.update(zip(names, units.apart(), strict=True))
 
     def _own_targets(self, echoes: Echoes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
@@ -107,18 +224,16 @@ class Vl53l5cxReceiver:
             depth,
             signal,
             settings.pulse_width,
-            settings.threshold,
+            settings.lit_threshold,
             settings.target_order == 'closest',
         )
         return tuple(target.reshape(-1, zones) for target in targets)
 
-    def _leak(
-        self, depth: np.ndarray, signal: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _leak(self, depth: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         Depth and signal (S, Z) with the light of the brightest neighbour mixed in.
 
-        And where it drowns the zone's own target.
+        Where the leak outshines the zone's own target, the sharpener takes it out: no target.
         """
         shape = (len(depth), self._model.rows, self._model.columns)
         neighbour_signal, neighbour_depth = _brightest_neighbour(
@@ -128,61 +243,73 @@ class Vl53l5cxReceiver:
         leak_depth = neighbour_depth.reshape(depth.shape)
         merging = (signal > 0.0) & (np.abs(leak_depth - depth) < self._settings.pulse_width)
         drowned = ~merging & (leak > signal) & (leak > self._settings.threshold)
-        share = np.where(merging, leak / np.maximum(signal + leak, 1e-30), drowned)
-        return depth + share * (leak_depth - depth), np.where(drowned, leak, signal), drowned
+        share = np.where(merging, leak / np.maximum(signal + leak, 1e-30), 0.0)
+        return depth + share * (leak_depth - depth), np.where(drowned, 0.0, signal)
 
     def _sigma(self, depth: np.ndarray, signal: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        """
-        Noise (S, Z) of the depth [m]: Table I and a floor.
-
-        More for faint targets and for broadened pulses.
-        """
+        """Core of the noise (S, Z) of the depth [m]: more for faint targets and wide pulses."""
         settings = self._settings
-        base = np.hypot(self._model.sigma(depth), settings.noise_floor)
-        faintness = 1.0 + settings.threshold / np.maximum(signal, settings.threshold)
-        return base * np.sqrt(faintness * (1.0 + (spread / settings.pulse_width) ** 2))
+        base = np.interp(depth, settings.noise_distance, settings.noise)
+        broadening = 1.0 + (spread / settings.pulse_width) ** 2
+        return base * np.sqrt((1.0 + settings.faint_noise * self._faintness(signal)) * broadening)
 
-    def _status(self, depth, signal, spread, blurred, uniform, before) -> np.ndarray:
-        """Target status (S, Z), the gravest first."""
-        settings, model = self._settings, self._model
+    def _faintness(self, signal: np.ndarray) -> np.ndarray:
+        """(S, Z): 1 for a target that is hardly seen, towards 0 for a bright one."""
+        threshold = self._settings.lit_threshold
+        return threshold / np.maximum(signal, threshold)
+
+    def _status(
+        self,
+        depth: np.ndarray,
+        signal: np.ndarray,
+        spread: np.ndarray,
+        uniform: np.ndarray,
+        units: Units,
+    ) -> np.ndarray:
+        """Target status (S, Z), the gravest first; uniform (6, S, Z) decides what is chance."""
+        settings = self._settings
         none = (
-            (signal < settings.threshold)
-            | (depth > model.max_range)
-            | (uniform < settings.dropout)
+            (signal < settings.lit_threshold)
+            | (depth > self._model.max_range)
+            | (uniform[1] < settings.dropout)
+            | ((depth < settings.near) & units.blind)
         )
-        inconsistent = uniform > 1.0 - settings.inconsistent
-        faint = signal < 1.15 * settings.threshold
-        known = before >= 0
+        goes_on = np.where(units.stray, settings.stray_stays, settings.stray)
         conditions = [
+            none & (uniform[2] < goes_on),
+            none & (uniform[3] < settings.faint),
             none,
-            depth < model.min_range,
-            blurred,
-            inconsistent,
-            faint,
-            ~known,
-            before == 0,
+            uniform[3] < settings.inconsistent,
+            ~units.seen & (uniform[4] < settings.new_target),
             spread > settings.wide_pulse,
         ]
         statuses = [
-            TOF_NO_TARGET,
-            TOF_TOO_CLOSE,
-            STATUS_BLURRED,
-            STATUS_INCONSISTENT,
+            STATUS_STRAY,
             STATUS_FAINT,
-            STATUS_FIRST,
+            TOF_NO_TARGET,
+            STATUS_INCONSISTENT,
             STATUS_NEW_TARGET,
             STATUS_WIDE_PULSE,
         ]
         return np.select(conditions, statuses, TOF_VALID).astype(np.uint8)
 
-    def _memory(self, names: Sequence[str]) -> np.ndarray:
-        """
-        (S, Z) int8: 1 where the zone had a target in the frame before, 0 where not.
 
-        -1 at the first frame.
-        """
-        unknown = np.full(len(self._zone_cosine), -1, dtype=np.int8)
-        return np.stack([self._had_target.get(name, unknown).astype(np.int8) for name in names])
+def _whole(depth: np.ndarray) -> np.ndarray:
+    """Round to the millimetre."""
+    return np.round(depth / _MILLIMETRE) * _MILLIMETRE
+
+
+def _registered(
+    raw: np.ndarray, status: np.ndarray, units: Units, uniform: np.ndarray
+) -> np.ndarray:
+    """
+    Distance (S, Z) [m] in the driver's registers, of which `raw` is right where a target is.
+
+    With status 2 it is 0 or beyond 3.5 m, with status 4 often the last one or far away.
+    """
+    far = _whole(3.5 + 0.8 * uniform)
+    stray, faint = np.where(uniform < 0.24, 0.0, far), np.where(uniform < 0.3, far, units.register)
+    return np.select([status == STATUS_STRAY, status == STATUS_FAINT], [stray, faint], raw)
 
 
 def _sub_directions(model: TofModel, sub_rays: int) -> np.ndarray:
@@ -204,20 +331,21 @@ def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndar
     There are up to eight round it.
     """
     rows, columns = signal.shape[1:]
-    margin = ((0, 0), (1, 1), (1, 1))
-    padded = np.pad(signal, margin), np.pad(depth, margin)
-    shifts = [
-        (slice(r, r + rows), slice(c, c + columns))
-        for r in range(3)
-        for c in range(3)
-        if (r, c) != (1, 1)
-    ]
-    around = [np.stack([grid[:, down, across] for down, across in shifts]) for grid in padded]
-    brightest = np.argmax(around[0], axis=0)[None]
-    return tuple(np.take_along_axis(grid, brightest, axis=0)[0] for grid in around)
+    signals = np.zeros((len(signal), rows + 2, columns + 2))
+    depths = signals.copy()
+    signals[:, 1:-1, 1:-1], depths[:, 1:-1, 1:-1] = signal, depth
+    best_signal, best_depth = np.full(signal.shape, -1.0), np.zeros(signal.shape)
+    for row in range(3):
+        for column in range(3):
+            if (row, column) != (1, 1):
+                there = np.s_[:, row : row + rows, column : column + columns]
+                brighter = signals[there] > best_signal
+                best_signal = np.where(brighter, signals[there], best_signal)
+                best_depth = np.where(brighter, depths[there], best_depth)
+    return best_signal, best_depth
 
 
-@njit(cache=True)
+@kernel
 def _targets(depth, signal, width, threshold, closest):
     """
     Depth, signal and spread (N,) of the reported pulse among K returns (N, K) of each zone.
@@ -245,7 +373,7 @@ def _targets(depth, signal, width, threshold, closest):
     return best_depth, best_signal, best_spread
 
 
-@njit(cache=True)
+@kernel
 def _gather(depth, signal, centre, width):
     """Total, mean and standard deviation of the returns within `width` of a depth, weighted."""
     total, first, second = 0.0, 0.0, 0.0

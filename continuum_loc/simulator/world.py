@@ -12,7 +12,7 @@ Samples come in the order of their stamps. The same seed gives the same samples,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 import heapq
 import logging
@@ -38,11 +38,15 @@ from continuum_loc.simulator.plant import (
     node_arclengths,
     PlantSettings,
 )
+from continuum_loc.simulator.readout import ReadoutSettings
 from continuum_loc.simulator.trajectories import Drive, trajectory
 import numpy as np
 
 if TYPE_CHECKING:
+    from continuum_loc.simulator.readout import Readout
     from continuum_loc.simulator.scene import Scene
+    from continuum_loc.simulator.tof import TofSensorModel
+    from continuum_loc.simulator.vl53l5cx import Vl53l5cxSettings
 
 TRUTH_RATE = 100.0
 ENCODER_RATE = 50.0
@@ -54,10 +58,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Stream:
-    """One kind of sensor: its rate [Hz] and how to sample it at (stamp, seconds)."""
+    """
+    One kind of sensor, or one sensor: its rate [Hz] and how to sample it at (stamp, seconds).
+
+    phase: when its first sample is taken [s].
+    """
 
     rate: float
-    sample: Callable[[int, float], list[Any]]
+    sample: Callable[[int, float], Iterable[Any]]
+    phase: float = 0.0
 
 
 class World:
@@ -67,6 +76,9 @@ class World:
     plant: PlantSettings, a name or a YAML file; None takes the bundled plant of the robot's name.
     trajectory: a name of `trajectories.trajectory`, or a Drive.
     scene: None is empty space, without ToF frames.
+    tof_settings, readout: how ToF sensors of the fidelity `vl53l5cx` depart from ideal, and how
+    their frames come; None takes what public flights show.
+    T_magnet_true: (4, 4), where the magnet sits in the frame where it should; None: there.
     faults: wrappers of `faults`, applied to the stream in order.
     """
 
@@ -79,6 +91,9 @@ class World:
         plant: PlantSettings | str | Path | None = None,
         profile: str = 'live',
         tof_fidelity: str = 'paper',
+        tof_settings: Vl53l5cxSettings | None = None,
+        readout: ReadoutSettings | None = None,
+        T_magnet_true: np.ndarray | None = None,
         seed: int = 0,
         faults: tuple = (),
         start_stamp: int = DEFAULT_START,
@@ -94,7 +109,8 @@ class World:
         self.trajectory = _resolve(trajectory, robot, self.plant)
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
         _check_fidelity(tof_fidelity)
-        self.tof_fidelity = tof_fidelity
+        self.tof_fidelity, self.tof_settings = tof_fidelity, tof_settings
+        self.readout, self.T_magnet_true = readout or ReadoutSettings(), T_magnet_true
         model = build_model(robot, self.plant, scene, profile, self.trajectory.supported)
         self.body = _Body(robot, self.plant, model, self.trajectory)
         self.motion = Motion()
@@ -130,7 +146,7 @@ class World:
             self.motion.append(state)
         streams = self._streams()
         for stamp, _, stream in heapq.merge(
-            *(_instants(i, s.rate, duration) for i, s in enumerate(streams))
+            *(_instants(i, s, duration) for i, s in enumerate(streams))
         ):
             self._now = stamp / NANOSECONDS
             while not self.motion.covers(self._now):
@@ -146,11 +162,15 @@ class World:
             (robot.strain, self._strain_stream),
             (robot.hall, self._hall_stream),
             (robot.trackers, self._tracker_stream),
-            (robot.tof and self.scene, self._tof_stream),
         ):
             rng = next(generators)
             if present:
                 streams.append(make(rng))
+        rng = next(generators)
+        if robot.tof and self.scene and self.tof_fidelity == 'paper':
+            streams.append(self._tof_stream(rng))
+        elif robot.tof and self.scene:
+            streams.extend(self._real_tof_streams(rng))
         return streams
 
     def _truth(self, stamp: int, time: float) -> list[TruthSample]:
@@ -201,6 +221,8 @@ class World:
         def sample(stamp: int, time: float) -> list:
             nodes = self.motion.pose(time)
             T_map_magnet = backbone(nodes, self.nodes_s, magnet.s) if magnet else nodes[0]
+            if self.T_magnet_true is not None:
+                T_map_magnet = T_map_magnet @ self.T_magnet_true
             return model.measure(stamp, pose(time), T_map_magnet)
 
         return _Stream(self.robot.hall_model.rate, sample)
@@ -219,13 +241,46 @@ class World:
         pose = self._posed(self.robot.tof)
 
         def sample(stamp: int, time: float) -> list:
-            return model.measure(pose(time), names, stamp, body_capsules=self._capsules(time))
+            body = self._capsules(self.motion.pose(time))
+            return model.measure(pose(time), names, stamp, body_capsules=body)
 
         return _Stream(self.robot.tof_model.rate, sample)
 
-    def _capsules(self, time: float) -> np.ndarray:
+    def _real_tof_streams(self, rng: np.random.Generator) -> Iterator[_Stream]:
+        """Yield one stream per sensor: real ones are out of step, and each has its own rate."""
+        from continuum_loc.simulator.raycast import RayCaster
+        from continuum_loc.simulator.readout import Readout
+        from continuum_loc.simulator.tof import TofSensorModel
+
+        caster, rate = RayCaster(self.scene), self.robot.tof_model.rate
+        for sensor in self.robot.tof:
+            own = np.random.default_rng(rng.integers(2**63))
+            model = TofSensorModel(
+                self.robot.tof_model, caster, self.tof_fidelity, own, self.tof_settings
+            )
+            phase = own.uniform(0.0, 1.0 / rate)
+            true_rate = rate * (1.0 + self.readout.rate_tolerance * own.standard_normal())
+            sample = self._read_out(model, sensor, Readout(self.readout, own))
+            yield _Stream(true_rate, sample, phase)
+
+    def _read_out(
+        self, model: TofSensorModel, sensor: Sensor, readout: Readout
+    ) -> Callable[[int, float], Iterable[Any]]:
+        """Make the sampling of one ToF sensor: of an exposure comes what is read out then."""
+        (node,), mount = self._mounts((sensor,))
+
+        def sample(stamp: int, time: float) -> Iterator[Any]:
+            nodes = self.motion.pose(time)
+            frames = model.measure(
+                nodes[node] @ mount, [sensor.name], stamp, self._capsules(nodes)
+            )
+            return readout.take(frames[0])
+
+        return sample
+
+    def _capsules(self, T_map_node: np.ndarray) -> np.ndarray:
         """(M, 7) ends and radius of the body's pieces, as `raycast.cast_capsules` takes them."""
-        points = self.motion.pose(time)[:, :3, 3]
+        points = T_map_node[:, :3, 3]
         return np.column_stack(
             [points[:-1], points[1:], np.full(len(points) - 1, self.robot.radius)]
         )
@@ -387,7 +442,8 @@ def _generators(seed: int) -> Iterator[np.random.Generator]:
     return (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(16))
 
 
-def _instants(stream: int, rate: float, duration: float) -> Iterator[tuple[int, int, int]]:
-    """(stamp from the start [ns], priority, stream) at k / rate, while before `duration`."""
-    count = int(np.ceil(duration * rate - 1e-9))
-    return ((round(k * NANOSECONDS / rate), stream, stream) for k in range(count))
+def _instants(number: int, stream: _Stream, duration: float) -> Iterator[tuple[int, int, int]]:
+    """(stamp from the start [ns], priority, number) at phase + k / rate, before `duration`."""
+    count = int(np.ceil((duration - stream.phase) * stream.rate - 1e-9))
+    first = round(stream.phase * NANOSECONDS)
+    return ((first + round(k * NANOSECONDS / stream.rate), number, number) for k in range(count))

@@ -4,7 +4,8 @@ Many trials in several processes.
 One failure takes no other along, and an interrupted campaign continues.
 
 OUT/bags/<recording>/     what was simulated, kept: trials that differ in map or settings replay
-                          the same bag; made anew when the simulator's code has changed
+                          the same bag; made anew when the trial, a file that it names or the
+                          simulator's code has changed
 OUT/trials/<trial>/       a run folder per trial, or `error.txt` with what went wrong; run anew
                           when configuration, recording, map or the filter's code has changed
 """
@@ -20,7 +21,8 @@ import shutil
 import traceback
 from typing import Any, TYPE_CHECKING
 
-from continuum_loc.offline.claims import plain
+from continuum_loc.errors import StudyError
+from continuum_loc.offline.as_json import plain
 from continuum_loc.offline.parallel import (
     configuration_digest,
     Outcome,
@@ -28,13 +30,13 @@ from continuum_loc.offline.parallel import (
     Progress,
     show_progress,
 )
-from continuum_loc.offline.source import replay_digest, simulation_digest
+from continuum_loc.offline.source import content_digest, replay_digest, simulation_digest
 from continuum_loc.offline.trials import Trial
 
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
 
-MADE_BY = 'made_by.txt'  # in a recording's folder: the digest of the code that simulated it
+MADE_BY = 'made_by.txt'  # in a recording's folder: the digest of what it was simulated from
 
 
 def run_campaign(
@@ -51,6 +53,7 @@ def run_campaign(
     by itself.
     """
     progress = progress or show_progress
+    require_names(trials)
     failed = record_bags(trials, out, jobs, progress)
     todo = [(out, trial, settings) for trial in trials if trial.recording not in failed]
     found = {}
@@ -68,11 +71,10 @@ def record_bags(
     Returns {recording: error} of what failed.
     """
     progress = progress or show_progress
-    bags = {trial.recording: trial for trial in trials if not recorded(bag_of(out, trial))}
+    bags = one_of_each_recording(trials)
+    todo = [(out, trial) for trial in bags if not recorded(bag_of(out, trial), trial)]
     failed = {}
-    for done in progress(
-        parallel(_record, [(out, trial) for trial in bags.values()], jobs), len(bags), 'simulating'
-    ):
+    for done in progress(parallel(_record, todo, jobs), len(todo), 'simulating'):
         failed |= done
     return failed
 
@@ -82,17 +84,57 @@ def bag_of(out: Path, trial: Trial) -> Path:
     return out / 'bags' / trial.recording
 
 
-def recorded(bag: Path) -> bool:
+def require_names(trials: Sequence[Trial]) -> None:
+    """Raise StudyError where two different trials have one name, under which results lie."""
+    by_name: dict[str, Trial] = {}
+    for trial in trials:
+        if by_name.setdefault(trial.name, trial) != trial:
+            raise StudyError(f"two different trials are called '{trial.name}'")
+
+
+def one_of_each_recording(trials: Sequence[Trial]) -> list[Trial]:
     """
-    Whether a recording is there, and from the simulator as it is.
+    Return the first trial of each recording.
+
+    Raises StudyError where two would be recorded under one name, and are not the same.
+    """
+    first: dict[str, Trial] = {}
+    for trial in trials:
+        known = first.setdefault(trial.recording, trial)
+        if known is not trial and made_from(known) != made_from(trial):
+            raise StudyError(
+                f"two trials are recorded as '{trial.recording}' and are not the same: "
+                'give robots, scenes, trajectories and plants names of their own'
+            )
+    return list(first.values())
+
+
+def recorded(bag: Path, trial: Trial) -> bool:
+    """
+    Whether a recording is there, and is what the simulator as it is makes of the trial.
 
     One that does not say what made it was put there by somebody, who will know.
     """
-    return bag.is_dir() and made_by(bag) in ('', simulation_digest())
+    return bag.is_dir() and _mark(bag) in ('', made_from(trial))
+
+
+def made_from(trial: Trial) -> str:
+    """Digest all that decides a trial's recording: what it says, files it names, and code."""
+    said = {name: value for name, value in asdict(trial).items() if name != 'map_scene'}
+    files = {
+        name: content_digest(Path(value))
+        for name, value in said.items()
+        if isinstance(value, str) and Path(value).is_file()
+    }
+    return configuration_digest(said, files, simulation_digest())
 
 
 def made_by(bag: Path) -> str:
-    """Digest of the code that simulated a recording; empty where it does not say."""
+    """Return what tells a recording from another: what it was made from, else its content."""
+    return _mark(bag) or content_digest(bag)
+
+
+def _mark(bag: Path) -> str:
     mark = bag / MADE_BY
     return mark.read_text().strip() if mark.is_file() else ''
 
@@ -113,7 +155,7 @@ def _record(out: Path, trial: Trial) -> dict[str, str]:
     try:
         bag.parent.mkdir(parents=True, exist_ok=True)
         write_bag(partial, simulate(trial))
-        (partial / MADE_BY).write_text(simulation_digest() + '\n')
+        (partial / MADE_BY).write_text(made_from(trial) + '\n')
         _remove(bag)
         partial.rename(bag)  # a bag under its name is a whole one
     except Exception as error:
@@ -135,21 +177,17 @@ def _estimate(out: Path, trial: Trial, settings: EstimatorSettings | None) -> Ou
 
 def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | None) -> Outcome:
     from continuum_loc.mapping.map_files import load_map
+    from continuum_loc.offline.localise import make_filter, trial_settings
     from continuum_loc.offline.replay import replay
     from continuum_loc.offline.runs import save_run
-    from continuum_loc.offline.trials import (
-        configuration,
-        make_filter,
-        scene_map_file,
-        trial_settings,
-    )
+    from continuum_loc.offline.trial_runs import configuration, trial_map_file
     from continuum_loc.robot import load_robot
 
     settings = settings or trial_settings(trial)
-    map_file = scene_map_file(trial.map_scene or trial.scene)
+    map_file = trial_map_file(trial)
     resolved = configuration(trial, estimator=settings)
     key = configuration_digest(
-        resolved, asdict(trial), replay_digest(), made_by(bag), map_file.name
+        resolved, asdict(trial), replay_digest(__name__), made_by(bag), map_file.name
     )
     summary_file = folder / 'summary.json'
     if summary_file.is_file():

@@ -11,15 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from continuum_loc.magnet import with_moment
+from continuum_loc.errors import StudyError
+from continuum_loc.magnet import dipole_moment
 from continuum_loc.measurements import FieldSample, ImuSample
 from continuum_loc.robot import RobotDescription
-from continuum_loc.shape import curves
-from continuum_loc.shape.attitude import EulerFilter, GRAVITY
+from continuum_loc.shape.attitude import GRAVITY
 from continuum_loc.shape.calibration import module_mounts
+from continuum_loc.shape.curves import CurveMethod
 from continuum_loc.shape.position import PositionSolver
 from continuum_loc.shape.rest import Rest
 import numpy as np
+from studies.support.euler_filter import EulerFilter
+from studies.support.shape_curves import fit_projected, printed_quadratic_bezier
 
 PAPER_MOMENT = 0.836  # A m^2
 
@@ -48,37 +51,23 @@ class Background:
 
     @classmethod
     def of(cls, rest: Rest, rest_without_magnet: Rest) -> Background:
-        """
-        From a rest with the magnet and one without it.
-
-        What the IMU should read is +g along its z.
-        """
+        """Subtract what should read: +g along the IMU's z, and no field without the magnet."""
         return cls(rest.gyro, rest.accel - [0.0, 0.0, GRAVITY], rest_without_magnet.field)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperEstimate:
-    """
-    Points (M + 1, 3) [m] and tangents (M + 1, 3) of magnet and modules, at the last sample.
-
-    In the base frame.
-    """
+    """Points (M + 1, 3) [m] and tangents (M + 1, 3) of magnet and modules in the base frame."""
 
     points: np.ndarray
     tangents: np.ndarray
     mends: frozenset[str]
 
-    def curve(self, method: curves.CurveMethod, samples: int = 61) -> np.ndarray:
-        """
-        Draw (samples, 3) points of the projected curve.
-
-        The quadratic one has the printed sign of kappa unless mended.
-        """
+    def curve(self, method: CurveMethod, samples: int = 61) -> np.ndarray:
+        """Draw (samples, 3) points of the projected curve, with kappa as printed unless mended."""
         if method == 'quadratic_bezier' and 'kappa' not in self.mends:
             return printed_quadratic_bezier(self.points, self.tangents, samples)
-        return curves.fit_curve(
-            self.points, self.tangents, method, projected=True, samples=samples
-        )
+        return fit_projected(self.points, self.tangents, method, samples)
 
 
 def paper_pipeline(
@@ -87,14 +76,10 @@ def paper_pipeline(
     background: Background,
     mends: Iterable[str] = (),
 ) -> PaperEstimate:
-    """
-    Eqs. 1-10 over a recording of an upright robot.
-
-    Raises ValueError for a mend that does not exist.
-    """
+    """Eqs. 1-10 over a recording of an upright robot. Raises StudyError for an unknown mend."""
     mends = frozenset(mends)
     if mends - set(MENDS):
-        raise ValueError(f'unknown mends {sorted(mends - set(MENDS))}; valid: {", ".join(MENDS)}')
+        raise StudyError(f'unknown mends {sorted(mends - set(MENDS))}; valid: {", ".join(MENDS)}')
     imu_mount, hall_mount = module_mounts(robot)
     R_imu_hall = imu_mount.swapaxes(1, 2) @ hall_mount  # eq. 8
     R_world_imu, field = _last_readings(robot, samples, background, mends)
@@ -103,7 +88,8 @@ def paper_pipeline(
     field_base = np.einsum('mij,mj->mi', imu_mount, field_world)
     tangents = np.einsum('mij,mj->mi', imu_mount, R_world_imu[:, :, 2])
     s = np.array([robot.sensor_arclength(sensor.name) for sensor in robot.hall])
-    magnet = with_moment(robot.magnet, np.sign(robot.magnet.remanence) * PAPER_MOMENT)
+    strength = PAPER_MOMENT / abs(dipole_moment(robot.magnet))
+    magnet = robot.magnet.model_copy(update={'remanence': strength * robot.magnet.remanence})
     positions = (
         PositionSolver(magnet, s, 'ring' if 'ring' in mends else 'dipole')
         .solve(field_base)
@@ -145,17 +131,3 @@ def _last_readings(
         else:
             field[hall[sample.sensor]] = sample.field - background.field[hall[sample.sensor]]
     return np.stack([f.R_map_imu for f in filters]), field
-
-
-def printed_quadratic_bezier(points: np.ndarray, tangents: np.ndarray, samples: int) -> np.ndarray:
-    """
-    Eqs. 12-14 and 23-24 with kappa exactly as printed.
-
-    Not finite where neighbouring tangents are parallel.
-    """
-    p, n = curves.project(points), curves.project(tangents)
-    chord = np.diff(p, axis=0)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        kappa = curves.cross(n[1:], chord) / curves.cross(n[:-1], n[1:])
-        control = p[:-1] + kappa[:, None] * n[:-1]
-        return curves.lift(curves.quadratic_chain(p[:-1], control, p[1:], samples), points)

@@ -24,11 +24,7 @@ def is_hold_out(trial: Trial) -> bool:
 
 
 def require_unseen(trials: list[Trial]) -> None:
-    """
-    Raise StudyError where a claim would rest on what the filter was tuned on.
-
-    That is a scene with a trajectory.
-    """
+    """Raise StudyError where a claim would rest on a scene and trajectory that were tuned on."""
     seen = sorted({trial.name for trial in trials if is_hold_out(trial)})
     if seen:
         raise StudyError(f'tuned on, so no claim may rest on it: {", ".join(seen)}')

@@ -1,9 +1,8 @@
-"""Every sensor's factor; the filter makes one of each kind that the robot has."""
+"""Every sensor's factor; the filter makes one of each kind that its setup wants."""
 
 from __future__ import annotations
 
-from continuum_loc.errors import MeasurementError
-from continuum_loc.estimator.factors.base import ClockScores, Factor, FactorReport
+from continuum_loc.estimator.factors.base import ClockScores, Factor, FactorReport, Guess, Setup
 from continuum_loc.estimator.factors.field import FieldFactor
 from continuum_loc.estimator.factors.gravity import GravityFactor
 from continuum_loc.estimator.factors.gyro import GyroFactor
@@ -18,6 +17,7 @@ FACTORS: tuple[type[Factor], ...] = (
     InsertionFactor,
     GravityFactor,
     FieldFactor,
+    TofFactor,
 )
 
-__all__ = ['ClockScores', 'FACTORS', 'Factor', 'FactorReport', 'MeasurementError', 'TofFactor']
+__all__ = ['ClockScores', 'FACTORS', 'Factor', 'FactorReport', 'Guess', 'Setup', 'TofFactor']

@@ -1,71 +1,114 @@
 """
-Contract that every sensor's factor keeps.
+The contract that every sensor's factor keeps.
 
-A new sensor is one file beside this one and an entry in FACTORS.
-
-A factor turns a measurement into a *row* when it arrives (a tuple of floats and arrays, in the
-body frame of its node), stacks the rows of an interval into arrays once, and adds their normal
-equations to the interval's blocks each time that the interval is linearised.
+A factor turns a measurement into a *row* when it arrives (a named tuple, in the body frame of its
+node), stacks the rows of an interval into a *batch* of arrays once, and adds their normal
+equations to the interval's each time that it is linearised. It owns what it remembers of its
+sensors; what others decide (whom to believe, how widely to match) comes in by `weigh` and
+`loosen`. A new sensor is one file beside this one and an entry in FACTORS.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 from continuum_loc.errors import MeasurementError
-from continuum_loc.estimator.chain import Blocks
+from continuum_loc.estimator import gp
+from continuum_loc.estimator.normal import Normal
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
 from continuum_loc.robot import RobotDescription
 import numpy as np
 
 
-@dataclass(slots=True)
-class FactorReport:
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What factors are made from; the map's lookup and surface are made once, when asked for."""
+
+    robot: RobotDescription
+    grid: Grid
+    settings: EstimatorSettings
+    prior_map: Any = None  # a `PriorMap`, or None
+
+    @cached_property
+    def surface(self):
+        from continuum_loc.estimator.surface import surface_of
+
+        return surface_of(self.prior_map, self.settings.tof.planarity_power)
+
+
+class FactorReport(NamedTuple):
     """
     How an interval's measurements of one kind fit.
 
-    Robust cost, sum of squared normalised residuals and their number, for each sensor its
-    [usable, fitting] counts, and for each gyro the variance (3,) of the turns that the motion
-    between the knots does not follow [rad^2]. `flicker` counts for each ToF sensor zones seen in
-    two frames in a row, and those of them that the map matched in just one.
+    Robust cost, sum of squared normalised residuals and their number. Of the factor's S sensors,
+    where it tells: fits (S, 2), their usable and fitting samples; rattle (S, 3), the variance of
+    the turns that the motion between the knots does not follow [rad^2], nan where there was no
+    sample; flicker (S, 2), zones seen in two frames in a row and those of them that the map
+    matched in just one.
     """
 
-    cost: float = 0.0
-    squared: float = 0.0
-    count: int = 0
-    fits: dict[str, np.ndarray] = field(default_factory=dict)
-    rattle: dict[str, np.ndarray] = field(default_factory=dict)
-    flicker: dict[str, np.ndarray] = field(default_factory=dict)
+    cost: float
+    squared: float
+    count: int
+    fits: np.ndarray | None = None
+    rattle: np.ndarray | None = None
+    flicker: np.ndarray | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ClockScores:
+class ClockScores(NamedTuple):
     """
-    How an interval's cost depends on its S sensors' clocks, to second order.
+    How an interval's cost depends on the clocks of a factor's S sensors, to second order.
 
     gradient, information: (S,); coupling (2 D, S) with the offsets of the interval's two columns;
     spread: (S,) variance of the residuals that no offset explains over that of the noise.
     """
 
-    sensors: list[str]
     gradient: np.ndarray
     information: np.ndarray
     coupling: np.ndarray
     spread: np.ndarray
 
+    @classmethod
+    def zeros(cls, sensors: int, dim: int) -> ClockScores:
+        return cls(*np.zeros((2, sensors)), np.zeros((2 * dim, sensors)), np.zeros(sensors))
+
+
+@dataclass(slots=True)
+class Guess:
+    """Base (4, 4) and strain (N, 6) from which the first solve starts."""
+
+    T_map_base: np.ndarray
+    strain: np.ndarray
+
 
 class Factor(ABC):
-    """One kind of sensor on one robot."""
+    """
+    One kind of sensor on one robot.
+
+    sensors: names of those that may be suspect, in the order of reports and scores. weights: (S,)
+    how much each counts.
+    """
 
     name: ClassVar[str]
     consumes: ClassVar[type]
+    batch: ClassVar[type]  # named tuple of times and of what a row has, with a number in front
+    rate: float = 0.0  # [Hz] of its sensors, where these set the pace of the estimates
+    tight: bool = True  # whether it matches as narrowly as while tracking
 
-    def __init__(self, robot: RobotDescription, grid: Grid, settings: EstimatorSettings):
-        self.robot, self.grid, self.settings = robot, grid, settings
-        self.weights: dict[str, float] = {}  # of sensors that may become suspect
+    def __init__(self, setup: Setup, sensors: Collection[str] = ()):
+        self.robot, self.grid, self.settings = setup.robot, setup.grid, setup.settings
+        self.sensors, self.weights = tuple(sensors), np.ones(len(sensors))
+        self._work = gp.new_workspace()
+
+    @classmethod
+    def wanted(cls, setup: Setup) -> bool:
+        """Whether a filter of this setup has such a factor."""
+        return getattr(setup.settings, cls.name).enabled
 
     @abstractmethod
     def row(self, measurement: Any) -> tuple:
@@ -75,25 +118,42 @@ class Factor(ABC):
         Raises MeasurementError where it cannot be used.
         """
 
-    @abstractmethod
     def stack(self, times: np.ndarray, rows: list[tuple]) -> tuple:
         """Arrays of all rows of an interval; `times` (M,) seconds from the interval's start."""
+        return self.batch(times, *(np.array(column) for column in zip(*rows, strict=True)))
 
     @abstractmethod
-    def linearise(self, batch: tuple, a: Column, b: Column, blocks: Blocks) -> FactorReport:
+    def linearise(self, batch: tuple, a: Column, b: Column, normal: Normal) -> FactorReport:
         """Add the normal equations of `batch` between the columns a and b."""
 
     def clock_scores(self, batch: tuple, a: Column, b: Column) -> ClockScores | None:
         """Say how the cost depends on the sensors' clocks; None where that is not asked for."""
         return None
 
+    def awaited(self) -> bool:
+        """Whether the first guess of the body is a poor one without this kind of sample."""
+        return False
+
+    def guess(self, row: tuple, guess: Guess) -> None:  # noqa: B027
+        """Put what a row tells of base and shape into the first guess."""
+
+    def weigh(self, doubted: Collection[str], weight: float) -> bool:
+        """Have the sensors in `doubted` count by `weight`, others fully; True if that is new."""
+        before = self.weights
+        self.weights = np.array([weight if name in doubted else 1.0 for name in self.sensors])
+        return not np.array_equal(before, self.weights)
+
+    def loosen(self, iteration: int) -> bool:
+        """
+        Match as widely as befits an iteration (1, 2, ...) from a guess, 0 as while tracking.
+
+        True if what is matched has to be matched anew.
+        """
+        return False
+
 
 class Repeats:
-    """
-    Tells a frozen sensor.
-
-    Frozen: its samples are the same to the last bit more than `most` times in a row.
-    """
+    """Tells a frozen sensor: the same to the last bit more than `most` times in a row."""
 
     def __init__(self, most: int):
         self._most = most
@@ -103,9 +163,8 @@ class Repeats:
     def frozen(self, sensor: str, values: np.ndarray) -> bool:
         """Note a sample; True when the sensor has repeated itself too often."""
         data = np.ascontiguousarray(values).tobytes()
-        self._count[sensor] = (
-            self._count.get(sensor, 0) + 1 if self._last.get(sensor) == data else 0
-        )
+        again = self._last.get(sensor) == data
+        self._count[sensor] = self._count.get(sensor, 0) + 1 if again else 0
         self._last[sensor] = data
         return self._count[sensor] > self._most
 

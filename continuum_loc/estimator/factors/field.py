@@ -1,34 +1,45 @@
-"""
-Hall sensor: the field of the magnet at the base (and Earth's), in the body frame.
-
-See `magnet.py`.
-"""
+"""Hall sensor: the field of the magnet at the base (and Earth's), in the body frame."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from continuum_loc import lie
 from continuum_loc.errors import MeasurementError
-from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor
-from continuum_loc.estimator.output import interpolated_poses
-from continuum_loc.estimator.state import VELOCITY
+from continuum_loc.estimator.interpolation import interpolated
+from continuum_loc.estimator.normal import add_rows
+from continuum_loc.estimator.state import rows_in_time
 from continuum_loc.magnet import field_residual_and_jacobian
 from continuum_loc.measurements import FieldSample
 import numpy as np
 
 
-class FieldFactor(Factor):
-    """
-    Three-axis field at a node.
+class Row(NamedTuple):
+    """One sample: field (3,) in the node's frame [T], and one over its variance."""
 
-    Its noise is the sensor's, and a share of the field for what the model lacks.
-    """
+    node: int
+    measured: np.ndarray
+    weight: float
+
+
+class Batch(NamedTuple):
+    times: np.ndarray
+    nodes: np.ndarray
+    measured: np.ndarray
+    weights: np.ndarray
+
+
+class FieldFactor(Factor):
+    """Three-axis field at a node; its noise is the sensor's and, for the model, a share of it."""
 
     name = 'field'
     consumes = FieldSample
+    batch = Batch
 
-    def __init__(self, robot, grid, settings):
-        super().__init__(robot, grid, settings)
+    def __init__(self, setup):
+        super().__init__(setup)
+        robot, grid = self.robot, self.grid
         self._sensors = {
             hall.name: (
                 grid.node_at(robot.sensor_arclength(hall.name)),
@@ -40,7 +51,7 @@ class FieldFactor(Factor):
             along = np.array([robot.magnet.s, 0.0, 0.0, 0.0, 0.0, 0.0])
             self._T_map_magnet = robot.base.T_map_base @ lie.exp(along)
 
-    def row(self, measurement: FieldSample) -> tuple:
+    def row(self, measurement: FieldSample) -> Row:
         if self.robot.magnet is None:
             raise MeasurementError('not used', f"robot '{self.robot.name}' has no magnet")
         node, R_ring_hall = known_sensor(self._sensors, measurement.sensor, 'Hall')
@@ -53,33 +64,21 @@ class FieldFactor(Factor):
             options.scale * self.robot.hall_model.sigma,
             options.share * np.linalg.norm(measurement.field),
         )
-        return node, R_ring_hall @ measurement.field, sigma**-2.0
+        return Row(node, R_ring_hall @ measurement.field, sigma**-2.0)
 
-    def stack(self, times, rows):
-        return (
-            times,
-            np.array([row[0] for row in rows]),
-            np.array([row[1] for row in rows]),
-            np.array([row[2] for row in rows]),
-        )
-
-    def linearise(self, batch, a, b, blocks):
-        times, nodes, measured, weights = batch
-        T, J_pose = interpolated_poses(a, b, times, nodes)
+    def linearise(self, batch, a, b, normal):
+        at = interpolated(a, b, batch.times, batch.nodes, pose=True)
+        earth = np.array(self.settings.field.earth)
         e, J = field_residual_and_jacobian(
-            T, self.robot.magnet, self._T_map_magnet, measured, np.array(self.settings.field.earth)
+            at.T, self.robot.magnet, self._T_map_magnet, batch.measured, earth
         )
-        u2 = weights * np.sum(e**2, axis=1)
+        u2 = batch.weights * np.sum(e**2, axis=1)
         cauchy2 = self.settings.field.cauchy**2
         robust = 1.0 / (1.0 + u2 / cauchy2)
-        rows, index = J @ J_pose, np.empty(24, np.int64)
-        for m, node in enumerate(nodes):
-            gp.time_index(node, VELOCITY, self.grid.dim, index)
-            gp.add_rows(
-                blocks.H, blocks.g, index, e[m], rows[m], np.full(3, weights[m] * robust[m])
-            )
-        return FactorReport(
-            float(np.sum(0.5 * cauchy2 * np.log1p(u2 / cauchy2))),
-            float(u2 @ robust),
-            3 * len(times),
-        )
+        weights = np.repeat((batch.weights * robust)[:, None], 3, axis=1)
+        rows, index = J @ at.J_pose, np.empty(24, np.int64)
+        for m, node in enumerate(batch.nodes):
+            rows_in_time(node, self.grid.dim, index)
+            add_rows(normal, index, e[m], rows[m], weights[m])
+        cost = float(np.sum(0.5 * cauchy2 * np.log1p(u2 / cauchy2)))
+        return FactorReport(cost, float(u2 @ robust), 3 * len(u2))

@@ -6,16 +6,32 @@ A body-frame observation of a known map vector; e = R^T up |g| - f, de/dphi = ha
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from continuum_loc import lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
-from continuum_loc.estimator.state import VELOCITY
+from continuum_loc.estimator.normal import add_rows
+from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import ImuSample
-from numba import njit
 import numpy as np
 
 STANDARD_GRAVITY = 9.80665  # [m/s^2]
+
+
+class Row(NamedTuple):
+    """One sample: specific force (3,) in the node's frame [m/s^2]."""
+
+    node: int
+    force: np.ndarray
+
+
+class Batch(NamedTuple):
+    times: np.ndarray
+    nodes: np.ndarray
+    force: np.ndarray
 
 
 class GravityFactor(Factor):
@@ -23,20 +39,22 @@ class GravityFactor(Factor):
 
     name = 'gravity'
     consumes = ImuSample
+    batch = Batch
 
-    def __init__(self, robot, grid, settings):
-        super().__init__(robot, grid, settings)
-        up = np.array(settings.gravity.up)
+    def __init__(self, setup):
+        super().__init__(setup)
+        up = np.array(self.settings.gravity.up)
+        self._weight = self.settings.gravity.sigma**-2.0
         self._up = STANDARD_GRAVITY * up / np.linalg.norm(up)
         self._imus = {
             imu.name: (
-                grid.node_at(robot.sensor_arclength(imu.name)),
+                self.grid.node_at(self.robot.sensor_arclength(imu.name)),
                 imu.mount.T_ring_sensor[:3, :3],
             )
-            for imu in robot.imu
+            for imu in self.robot.imu
         }
 
-    def row(self, measurement: ImuSample) -> tuple:
+    def row(self, measurement: ImuSample) -> Row:
         node, R_ring_imu = known_sensor(self._imus, measurement.sensor, 'IMU')
         require_finite(measurement.linear_acceleration, 'specific force', measurement.sensor)
         excess = abs(np.linalg.norm(measurement.linear_acceleration) - STANDARD_GRAVITY)
@@ -44,59 +62,32 @@ class GravityFactor(Factor):
             raise MeasurementError(
                 'moving', f"specific force of '{measurement.sensor}' is {excess:.2f} m/s^2 off g"
             )
-        return node, R_ring_imu @ measurement.linear_acceleration
+        return Row(node, R_ring_imu @ measurement.linear_acceleration)
 
-    def stack(self, times, rows):
-        return times, np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-
-    def linearise(self, batch, a, b, blocks):
-        times, nodes, force = batch
-        squared = add_vectors(
-            blocks.H,
-            blocks.g,
-            a.T,
-            a.velocity,
-            b.T,
-            b.velocity,
-            b.time - a.time,
-            times,
-            nodes,
-            force,
-            self._up,
-            self.settings.gravity.sigma**-2.0,
-        )
-        return FactorReport(0.5 * squared, squared, 3 * len(times))
+    def linearise(self, batch, a, b, normal):
+        squared = _add(normal, a, b, batch, self._up, self._weight, self._work)
+        return FactorReport(0.5 * squared, squared, 3 * len(batch.times))
 
 
-@njit(cache=True)
-def add_vectors(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, measured, map_vector, weight):
-    W, V, M = lie_kernels.workspace()
-    J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((6, 24))
-    index, J, e, b, weights = (
-        np.empty(24, np.int64),
-        np.empty((3, 24)),
-        np.empty(3),
-        np.empty(6),
-        np.full(3, weight),
-    )
-    size = H.shape[0] // 2
+@kernel
+def _add(normal, a, b, batch, up, weight, work):
+    """Add the samples; returns the sum of weighted squared residuals."""
+    index, weights, J = np.empty(24, np.int64), np.full(3, weight), np.empty((3, 24))
+    e, turn, ad = np.empty(3), np.zeros(6), np.empty((6, 6))
     squared = 0.0
-    for m in range(times.shape[0]):
-        n = nodes[m]
-        gp.hermite(
-            T_a[n], v_a[n], T_b[n], v_b[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work
-        )
-        b[:] = 0.0
+    for m in range(batch.times.shape[0]):
+        gp.relate(ends_in_time(a, b, batch.nodes[m]), work)
+        gp.evaluate(work, batch.times[m], True, 6)
+        at = work[0]
         for i in range(3):
-            b[3 + i] = T[0, i] * map_vector[0] + T[1, i] * map_vector[1] + T[2, i] * map_vector[2]
-            e[i] = b[3 + i] - measured[m, i]
-        lie_kernels.ad(b, W[0])
+            turn[3 + i] = at.T[0, i] * up[0] + at.T[1, i] * up[1] + at.T[2, i] * up[2]
+            e[i] = turn[3 + i] - batch.force[m, i]
+        lie_kernels.ad(turn, ad)
         for i in range(3):
             for j in range(24):
                 J[i, j] = 0.0
                 for k in range(3):
-                    J[i, j] += W[0, i, k] * J_pose[3 + k, j]
-        gp.time_index(n, VELOCITY, size, index)
-        squared += gp.add_rows(H, g, index, e, J, weights)
+                    J[i, j] += ad[i, k] * at.J_pose[3 + k, j]
+        rows_in_time(batch.nodes[m], normal.g.shape[0] // 2, index)
+        squared += add_rows(normal, index, e, J, weights)
     return squared

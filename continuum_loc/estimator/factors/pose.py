@@ -6,44 +6,46 @@ e = Log(T_measured^-1 T), J = J_r(e)^-1 for a right perturbation.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from continuum_loc import lie, lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
-from continuum_loc.estimator.state import VELOCITY
+from continuum_loc.estimator.normal import gather, new_normal, scatter
+from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import EncoderSample, TrackedPose
-from numba import njit
 import numpy as np
 
 
+class Row(NamedTuple):
+    """One pose of a node (4, 4), and its information (6, 6) in the node's frame."""
+
+    node: int
+    T_map_node: np.ndarray
+    information: np.ndarray
+
+
+class Batch(NamedTuple):
+    times: np.ndarray
+    nodes: np.ndarray
+    T_map_node: np.ndarray
+    information: np.ndarray
+
+
 class _PoseFactor(Factor):
+    batch = Batch
     cauchy = np.inf
 
     def stack(self, times, rows):
-        nodes = np.array([row[0] for row in rows])
-        order = np.argsort(nodes, kind='stable')  # node by node
-        arrays = (np.array([rows[m][i] for m in order]) for i in (1, 2))
-        return times[order], nodes[order], *arrays
+        order = np.argsort([row.node for row in rows], kind='stable')  # node by node
+        return super().stack(times[order], [rows[m] for m in order])
 
-    def linearise(self, batch, a, b, blocks):
-        times, nodes, T_map_measured, information = batch
-        cost, squared = _add(
-            blocks.H,
-            blocks.g,
-            a.T,
-            a.velocity,
-            b.T,
-            b.velocity,
-            b.time - a.time,
-            times,
-            nodes,
-            T_map_measured,
-            information,
-            self.cauchy,
-        )
-        return FactorReport(
-            cost, squared, int(np.sum(np.diagonal(information, axis1=1, axis2=2) > 0.0))
-        )
+    def linearise(self, batch, a, b, normal):
+        cost, squared = _add(normal, a, b, batch, self.cauchy, self._work)
+        observed = np.diagonal(batch.information, axis1=1, axis2=2) > 0.0
+        return FactorReport(cost, squared, int(np.sum(observed)))
 
 
 class TrackerFactor(_PoseFactor):
@@ -52,25 +54,21 @@ class TrackerFactor(_PoseFactor):
     name = 'tracker'
     consumes = TrackedPose
 
-    def __init__(self, robot, grid, settings):
-        super().__init__(robot, grid, settings)
-        self.cauchy = settings.tracker.cauchy
+    def __init__(self, setup):
+        super().__init__(setup)
+        options = self.settings.tracker
+        self.cauchy = options.cauchy
         self._sensors = {
             sensor.name: (
-                grid.node_at(robot.sensor_arclength(sensor.name)),
+                self.grid.node_at(self.robot.sensor_arclength(sensor.name)),
                 lie.inverse(sensor.mount.T_ring_sensor),
             )
-            for sensor in robot.trackers
+            for sensor in self.robot.trackers
         }
-        self._default = (
-            np.array(
-                [settings.tracker.sigma_position] * 3
-                + [np.radians(settings.tracker.sigma_rotation_deg)] * 3
-            )
-            ** -2.0
-        )
+        turn = np.radians(options.sigma_rotation_deg)
+        self._default = np.array([options.sigma_position] * 3 + [turn] * 3) ** -2.0
 
-    def row(self, measurement: TrackedPose) -> tuple:
+    def row(self, measurement: TrackedPose) -> Row:
         node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, 'tracker')
         require_finite(measurement.T_map_sensor, 'pose', measurement.sensor)
         Ad = lie.adjoint(lie.inverse(T_sensor_ring))  # sensor-frame covariance to the ring's frame
@@ -84,7 +82,7 @@ class TrackerFactor(_PoseFactor):
                     'bad covariance',
                     f"covariance of '{measurement.sensor}' is not positive definite",
                 ) from None
-        return node, measurement.T_map_sensor @ T_sensor_ring, information
+        return Row(node, measurement.T_map_sensor @ T_sensor_ring, information)
 
 
 class InsertionFactor(_PoseFactor):
@@ -93,7 +91,11 @@ class InsertionFactor(_PoseFactor):
     name = 'insertion'
     consumes = EncoderSample
 
-    def row(self, measurement: EncoderSample) -> tuple:
+    @classmethod
+    def wanted(cls, setup):
+        return True
+
+    def row(self, measurement: EncoderSample) -> Row:
         insertion = self.robot.base.insertion
         if insertion.mode != 'measured':
             raise MeasurementError(
@@ -105,53 +107,60 @@ class InsertionFactor(_PoseFactor):
             )
         travel = float(measurement.position[measurement.names.index('insertion')])
         require_finite(np.array(travel), 'insertion', 'joint_states')
-        T_map_measured = self.robot.base.T_map_base.copy()
-        T_map_measured[:3, 3] += travel * T_map_measured[:3, 0]
+        T_map_base = self.robot.base.T_map_base.copy()
+        T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
         information[0, 0] = insertion.sigma**-2.0
-        return 0, T_map_measured, information
+        return Row(0, T_map_base, information)
+
+    def awaited(self):
+        return self.robot.base.insertion.mode == 'measured'
+
+    def guess(self, row, guess):
+        guess.T_map_base = row.T_map_node
 
 
-@njit(cache=True)
-def _add(H, g, T_a, v_a, T_b, v_b, dt, times, nodes, T_measured, information, cauchy):
-    W, V, M = lie_kernels.workspace()
-    W_own, V_own, M_own = lie_kernels.workspace()  # what `relate` left in the other one is kept
-    J_work = np.empty((2, 6, 24))
-    T, v, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((6, 24)), np.empty((0, 24))
-    H_node, g_node = np.zeros((24, 24)), np.zeros(24)
-    e, weighted, index = np.empty(6), np.empty(6), np.empty(24, np.int64)
-    J, work, local, slope = np.empty((6, 6)), np.empty((6, 24)), np.empty((6, 6)), np.empty(6)
-    size = H.shape[0] // 2
+@kernel
+def _add(normal, a, b, batch, cauchy, work):
+    """Add the poses; returns the robust cost and the sum of weighted squared residuals."""
+    total, local, index = new_normal(24), new_normal(6), np.empty(24, np.int64)
+    product, c2 = np.empty((6, 24)), cauchy * cauchy
     cost, squared, related = 0.0, 0.0, -1
-    for m in range(times.shape[0]):
-        n = nodes[m]
+    for m in range(batch.times.shape[0]):
+        n = batch.nodes[m]
         if n != related:  # poses of a node come after one another
-            gp.relate(T_a[n], T_b[n], v_b[n], W, V, M)
+            gp.relate(ends_in_time(a, b, n), work)
             related = n
-        gp.evaluate(T_a[n], v_a[n], dt, times[m], T, v, J_pose, J_rate, W, V, M, J_work)
-        lie_kernels.pose_error(T_measured[m], T, e, J, W_own, V_own, M_own)
-        lie_kernels.apply(information[m], e, weighted)
-        u2 = 0.0
-        for i in range(6):
-            u2 += e[i] * weighted[i]
-        robust = 1.0 / (1.0 + u2 / (cauchy * cauchy))
-        lie_kernels.product(information[m], J, W_own[0])
-        for i in range(6):
-            slope[i] = 0.0
-            for k in range(6):
-                slope[i] += robust * J[k, i] * weighted[k]
-            for j in range(6):
-                local[i, j] = 0.0
-                for k in range(6):
-                    local[i, j] += robust * J[k, i] * W_own[0, k, j]
-        gp.gather(H_node, g_node, local, slope, J_pose, work)
-        if m + 1 == times.shape[0] or nodes[m + 1] != n:
-            gp.time_index(n, VELOCITY, size, index)
-            gp.scatter(H, g, index, H_node, g_node, 1.0)
-        cost += (
-            0.5 * u2
-            if np.isinf(cauchy)
-            else 0.5 * cauchy * cauchy * np.log1p(u2 / (cauchy * cauchy))
-        )
+        gp.evaluate(work, batch.times[m], True, 6)
+        u2, robust = _local(work, batch.T_map_node[m], batch.information[m], c2, local)
+        gather(total, local, work[0].J_pose, product)
+        if m + 1 == batch.times.shape[0] or batch.nodes[m + 1] != n:
+            rows_in_time(n, normal.g.shape[0] // 2, index)
+            scatter(normal, index, total, 1.0)
+        cost += 0.5 * u2 if np.isinf(cauchy) else 0.5 * c2 * np.log1p(u2 / c2)
         squared += u2 * robust
     return cost, squared
+
+
+@kernel
+def _local(work, T_measured, information, c2, local):
+    """Write one pose's normal equations in its own frame; its squared error, and its weight."""
+    at = work[0]
+    gamma, J, scratch = at.gamma, at.right_gamma, at.scratch
+    weighted, by_error = scratch.powers[0], scratch.matrix
+    lie_kernels.pose_error(T_measured, at.T, gamma, J, scratch)
+    lie_kernels.apply(information, gamma.x, weighted)
+    u2 = 0.0
+    for i in range(6):
+        u2 += gamma.x[i] * weighted[i]
+    robust = 1.0 / (1.0 + u2 / c2)
+    lie_kernels.product(information, J, by_error)
+    for i in range(6):
+        local.g[i] = 0.0
+        for k in range(6):
+            local.g[i] += robust * J[k, i] * weighted[k]
+        for j in range(6):
+            local.H[i, j] = 0.0
+            for k in range(6):
+                local.H[i, j] += robust * J[k, i] * by_error[k, j]
+    return u2, robust

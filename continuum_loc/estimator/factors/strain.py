@@ -8,27 +8,59 @@ below sigma_kappa.
 
 from __future__ import annotations
 
-from continuum_loc import lie_kernels
+from typing import NamedTuple
+
+from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, require_finite
-from continuum_loc.estimator.state import NODE_DIM, STRAIN
+from continuum_loc.estimator.normal import gather, new_normal, Normal, scatter
+from continuum_loc.estimator.state import ends_along, rows_along, STRAIN
 from continuum_loc.measurements import StrainSample
-from numba import njit
 import numpy as np
 
 
-class StrainFactor(Factor):
-    """
-    Bending strain at any number of stations.
+class Row(NamedTuple):
+    """One sample: arclengths (M,), bending strain (M, 2) and its information (M, 2, 2)."""
 
-    It is interpolated in arclength at both knots and linearly in time.
+    s: np.ndarray
+    bending: np.ndarray
+    information: np.ndarray
+
+
+class Batch(NamedTuple):
     """
+    R readings of S stations.
+
+    A reading: its time, station, bending (2,) and information (2, 2). A station: its segment and
+    distance from the segment's first node.
+    """
+
+    times: np.ndarray
+    station: np.ndarray
+    bending: np.ndarray
+    information: np.ndarray
+    segments: np.ndarray
+    offsets: np.ndarray
+
+
+class Stations(NamedTuple):
+    """Bending of S stations at both knots, and what readings say of these four numbers."""
+
+    values: np.ndarray  # (S, 4)
+    J: np.ndarray  # (S, 4, 48) by the segment's two nodes, first at one knot, then at the other
+    H: np.ndarray  # (S, 4, 4)
+    g: np.ndarray  # (S, 4)
+
+
+class StrainFactor(Factor):
+    """Bending strain at any stations, by the Hermite in arclength and linearly in time."""
 
     name = 'strain'
     consumes = StrainSample
+    batch = Batch
 
-    def row(self, measurement: StrainSample) -> tuple:
+    def row(self, measurement: StrainSample) -> Row:
         if self.robot.strain is None:
             raise MeasurementError(
                 'unknown frame', f"robot '{self.robot.name}' has no strain sensor"
@@ -48,7 +80,7 @@ class StrainFactor(Factor):
                 f'{self.robot.length} m long',
             )
         bending = np.column_stack([-kappa * np.sin(theta), kappa * np.cos(theta)])
-        return s, bending, self._information(bending, kappa)
+        return Row(s, bending, self._information(bending, kappa))
 
     def _information(self, bending: np.ndarray, kappa: np.ndarray) -> np.ndarray:
         """(M, 2, 2) information of the bending strain."""
@@ -63,114 +95,103 @@ class StrainFactor(Factor):
         )
 
     def stack(self, times, rows):
-        """
-        Rows of one interval grouped by station.
-
-        The geometry of a station serves all its samples.
-        """
-        s = np.concatenate([row[0] for row in rows])
-        stations, station = rows[0][0], np.tile(np.arange(len(rows[0][0])), len(rows))
+        """Group the readings by station, whose geometry serves all its samples."""
+        s, bending, information = (np.concatenate(part) for part in zip(*rows, strict=True))
+        stations, station = rows[0].s, np.tile(np.arange(len(rows[0].s)), len(rows))
         if len(s) != len(station) or not np.array_equal(s, stations[station]):
             # Not the same stations every time.
             stations, station = np.unique(s, return_inverse=True)
-        return (
-            np.repeat(times, [len(row[0]) for row in rows]),
+        return Batch(
+            np.repeat(times, [len(row.s) for row in rows]),
             station.astype(np.int64),
-            np.concatenate([row[1] for row in rows]),
-            np.concatenate([row[2] for row in rows]),
+            bending,
+            information,
             *self.grid.segments(stations),
         )
 
-    def linearise(self, batch, a, b, blocks):
+    def linearise(self, batch, a, b, normal):
         cost, squared = _add(
-            blocks.H,
-            blocks.g,
-            a.T,
-            a.strain,
-            b.T,
-            b.strain,
-            b.time - a.time,
-            self.grid.s,
-            *batch,
-            self.settings.strain.cauchy,
+            normal, a, b, self.grid.s, batch, self.settings.strain.cauchy, self._work
         )
-        return FactorReport(cost, squared, 2 * len(batch[0]))
+        return FactorReport(cost, squared, 2 * len(batch.times))
 
+    def awaited(self):
+        return self.robot.strain is not None
 
-@njit(cache=True)
-def _add(
-    H,
-    g,
-    T_a,
-    eps_a,
-    T_b,
-    eps_b,
-    dt,
-    s,
-    times,
-    station,
-    bending,
-    information,
-    segments,
-    offsets,
-    cauchy,
-):
-    W, V, M = lie_kernels.workspace()
-    J_work = np.empty((2, 6, 24))
-    T, rate, J_pose, J_rate = np.empty((4, 4)), np.empty(6), np.empty((0, 24)), np.empty((2, 24))
-    stations = segments.shape[0]
-    local = np.zeros((stations, 4, 4))  # information of [bending at a; bending at b]
-    slope = np.zeros((stations, 4))
-    values = np.empty((stations, 4))
-    jacobians = np.zeros((stations, 4, 48))
-    for half in range(2):
-        T_end, eps = (T_a, eps_a) if half == 0 else (T_b, eps_b)
-        related = -1
-        for m in range(stations):
-            n, ds = segments[m], s[segments[m] + 1] - s[segments[m]]
-            if n != related:  # stations of a segment come after one another
-                gp.relate(T_end[n], T_end[n + 1], eps[n + 1], W, V, M)
-                related = n
-            gp.evaluate(T_end[n], eps[n], ds, offsets[m], T, rate, J_pose, J_rate, W, V, M, J_work)
-            for i in range(2):
-                values[m, 2 * half + i] = rate[4 + i]
-                for j in range(24):
-                    jacobians[m, 2 * half + i, 24 * half + j] = J_rate[i, j]
-    cost, squared = 0.0, 0.0
-    c2 = cauchy * cauchy
-    for r in range(times.shape[0]):
-        m, u = station[r], times[r] / dt
-        e0 = (1.0 - u) * values[m, 0] + u * values[m, 2] - bending[r, 0]
-        e1 = (1.0 - u) * values[m, 1] + u * values[m, 3] - bending[r, 1]
-        a, b, c = information[r, 0, 0], information[r, 0, 1], information[r, 1, 1]
-        u2 = a * e0 * e0 + 2.0 * b * e0 * e1 + c * e1 * e1
-        robust = 1.0 / (1.0 + u2 / c2)
-        f0, f1 = robust * (a * e0 + b * e1), robust * (b * e0 + c * e1)
+    def guess(self, row, guess):
+        order = np.argsort(row.s)
         for i in range(2):
-            share = 1.0 - u if i == 0 else u
-            slope[m, 2 * i] += share * f0
-            slope[m, 2 * i + 1] += share * f1
+            bending = row.bending[order, i]
+            guess.strain[:, 4 + i] = np.interp(self.grid.s, row.s[order], bending)
+
+
+@kernel
+def _add(normal, a, b, s, batch, cauchy, work):
+    """Add the readings; returns the robust cost and the sum of weighted squared residuals."""
+    count, dim = batch.segments.shape[0], normal.g.shape[0] // 2
+    stations = Stations(
+        np.empty((count, 4)),
+        np.zeros((count, 4, 48)),
+        np.zeros((count, 4, 4)),
+        np.zeros((count, 4)),
+    )
+    _predict(a, s, batch, stations, 0, work)
+    _predict(b, s, batch, stations, 1, work)
+    cost, squared = _read(b.time - a.time, batch, stations, cauchy * cauchy)
+    index, product, total = np.empty(48, np.int64), np.empty((4, 48)), new_normal(48)
+    for m in range(count):
+        n = batch.segments[m]
+        gather(total, Normal(stations.H[m], stations.g[m]), stations.J[m], product)
+        if m + 1 < count and batch.segments[m + 1] == n:
+            continue
+        rows_along(n, STRAIN, index)
+        for i in range(24):
+            index[24 + i] = dim + index[i]
+        scatter(normal, index, total, 1.0)
+    return cost, squared
+
+
+@kernel
+def _predict(column, s, batch, stations, half, work):
+    """Find the stations' bending at the older (half 0) or newer (1) knot."""
+    related = -1
+    for m in range(batch.segments.shape[0]):
+        n = batch.segments[m]
+        if n != related:  # stations of a segment come after one another
+            gp.relate(ends_along(column.T, column.strain, s, n), work)
+            related = n
+        gp.evaluate(work, batch.offsets[m], False, 4)
+        at = work[0]
+        for i in range(2):
+            stations.values[m, 2 * half + i] = at.v[4 + i]
+            for j in range(24):
+                stations.J[m, 2 * half + i, 24 * half + j] = at.J_rate[4 + i, j]
+
+
+@kernel
+def _read(dt, batch, stations, c2):
+    """Add what each reading says to its station; returns the robust cost and squared error."""
+    cost, squared, share = 0.0, 0.0, np.empty(2)
+    for r in range(batch.times.shape[0]):
+        m, u = batch.station[r], batch.times[r] / dt
+        share[0], share[1] = 1.0 - u, u
+        value, H, g = stations.values[m], stations.H[m], stations.g[m]
+        e0 = share[0] * value[0] + u * value[2] - batch.bending[r, 0]
+        e1 = share[0] * value[1] + u * value[3] - batch.bending[r, 1]
+        information = batch.information[r]
+        p, q, w = information[0, 0], information[0, 1], information[1, 1]
+        u2 = p * e0 * e0 + 2.0 * q * e0 * e1 + w * e1 * e1
+        robust = 1.0 / (1.0 + u2 / c2)
+        f0, f1 = robust * (p * e0 + q * e1), robust * (q * e0 + w * e1)
+        for i in range(2):
+            g[2 * i] += share[i] * f0
+            g[2 * i + 1] += share[i] * f1
             for j in range(2):
-                both = share * (1.0 - u if j == 0 else u) * robust
-                local[m, 2 * i, 2 * j] += both * a
-                local[m, 2 * i, 2 * j + 1] += both * b
-                local[m, 2 * i + 1, 2 * j] += both * b
-                local[m, 2 * i + 1, 2 * j + 1] += both * c
+                both = share[i] * share[j] * robust
+                H[2 * i, 2 * j] += both * p
+                H[2 * i, 2 * j + 1] += both * q
+                H[2 * i + 1, 2 * j] += both * q
+                H[2 * i + 1, 2 * j + 1] += both * w
         cost += 0.5 * c2 * np.log1p(u2 / c2)
         squared += u2 * robust
-    index, work = np.empty(48, np.int64), np.empty((4, 48))
-    H_segment, g_segment = np.zeros((48, 48)), np.zeros(48)
-    size = H.shape[0] // 2
-    for m in range(stations):
-        gp.gather(H_segment, g_segment, local[m], slope[m], jacobians[m], work)
-        if m + 1 < stations and segments[m + 1] == segments[m]:
-            continue
-        for i in range(6):
-            for half in range(2):
-                start = half * size + NODE_DIM * segments[m]
-                index[24 * half + i] = start + i
-                index[24 * half + 6 + i] = start + STRAIN + i
-                index[24 * half + 12 + i] = start + NODE_DIM + i
-                index[24 * half + 18 + i] = start + NODE_DIM + STRAIN + i
-        gp.scatter(H, g, index, H_segment, g_segment, 1.0)
     return cost, squared

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from continuum_loc.estimate import Estimate
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import nanoseconds, TofFrame
 from continuum_loc.robot import RobotDescription
 from continuum_loc.scene.anomalies import AnomalySettings, mahalanobis2
@@ -20,8 +19,6 @@ from continuum_loc.scene.reconstruct import reconstruct, Reconstruction
 from continuum_loc.trajectory import BASE, Trajectory
 from msg_tools.records import CloudRecord
 import numpy as np
-
-REACH = 0.05  # m, about what a reconstructed point may lie off the map
 
 
 class RecentPoses:
@@ -69,7 +66,6 @@ class SeenScene:
         self.duration = duration
         self.skipped = 0  # frames that no smoothed poses span, or that waited for too long
         self._robot, self._prior = robot, prior
-        self._index = None if prior is None else _ready_index(prior)
         self._search_radius = AnomalySettings().search_radius
         self._frames: list[TofFrame] = []
         self._jobs: deque[tuple[list[TofFrame], Trajectory]] = deque()
@@ -112,7 +108,7 @@ class SeenScene:
         points = reconstruct(self._robot, frames, trajectory)
         if self._prior is None:
             return points, np.full(len(points.points), np.nan)
-        squared, _ = mahalanobis2(points, self._prior, self._search_radius, self._index)
+        squared, _ = mahalanobis2(points, self._prior, self._search_radius, self._prior.index)
         return points, np.sqrt(squared)
 
     def clear(self) -> None:
@@ -153,11 +149,6 @@ class SeenScene:
             self._seen.popleft()
         while self._jobs and self._jobs[0][1].stamps[-1] < oldest:
             self.skipped += len(self._jobs.popleft()[0])
-
-
-def _ready_index(prior: PriorMap) -> VoxelIndex:
-    """Index a map with all that its lookups need, so that the first cloud does not wait for it."""
-    return prior.index(reach=REACH).prepare()
 
 
 def _joined(parts: list[np.ndarray], empty: tuple[int, ...] = (0,)) -> np.ndarray:

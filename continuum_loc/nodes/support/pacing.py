@@ -23,16 +23,22 @@ class Paced:
     Delivers (stamp, item) pairs of an iterator when their time has come.
 
     lookahead [s]: how far the iterator may run ahead. rate: data seconds per second.
+    longest_pause [s] of the data: a leap of the stamps farther than that is not waited for.
     """
 
     def __init__(
-        self, items: Iterator[tuple[int, Any]], lookahead: float, rate: float = 1.0
+        self,
+        items: Iterator[tuple[int, Any]],
+        lookahead: float,
+        rate: float = 1.0,
+        longest_pause: float = float('inf'),
     ) -> None:
         self._items, self._lookahead, self._rate = items, lookahead, rate
+        self._longest_pause = longest_pause * NANOSECONDS
         self._queue: Queue[Any] = Queue(maxsize=4000)
         self._stop = threading.Event()
         self._full = threading.Event()  # the first lookahead is prepared, or all there is
-        self._progress: int | None = None  # data stamp delivered last, at first the first
+        self._progress: int | None = None  # time paced by that was delivered last, or the first
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._prepare, name='lookahead', daemon=True)
 
@@ -68,17 +74,17 @@ class Paced:
         while not self._full.wait(POLL) and not self._stop.is_set():
             pass
         begin: float | None = None
-        for stamp, item in self._prepared():
+        for at, stamp, item in self._prepared():
             if begin is None:
-                begin, first = time.monotonic() + self._lookahead, stamp
+                begin, first = time.monotonic() + self._lookahead, at
                 on_start(stamp)
-            due = begin + (stamp - first) / NANOSECONDS / self._rate
+            due = begin + (at - first) / NANOSECONDS / self._rate
             if not self._wait_until(due):
                 break
-            self._progress = stamp
+            self._progress = at
             deliver(stamp, item, time.monotonic() - due)
 
-    def _prepared(self) -> Iterator[tuple[int, Any]]:
+    def _prepared(self) -> Iterator[tuple[int, int, Any]]:
         while not self._stop.is_set():
             try:
                 entry = self._queue.get(timeout=POLL)
@@ -97,18 +103,28 @@ class Paced:
 
     def _prepare(self) -> None:
         try:
-            for stamp, item in self._items:
-                if not self._put((stamp, item), stamp):
+            for at, stamp, item in self._steady():
+                if not self._put((at, stamp, item), at):
                     return
         except BaseException as error:  # handed to the thread that delivers
             self._error = error
         self._full.set()
         self._put(_END, 0)
 
-    def _put(self, entry: Any, stamp: int) -> bool:
+    def _steady(self) -> Iterator[tuple[int, int, Any]]:
+        """(time to pace by, stamp, item), both in ns: the same but for leaps that are skipped."""
+        skipped, last = 0, None
+        for stamp, item in self._items:
+            last = stamp if last is None else last
+            if abs(stamp - last) > self._longest_pause:
+                skipped += stamp - last
+            last = stamp
+            yield stamp - skipped, stamp, item
+
+    def _put(self, entry: Any, at: int) -> bool:
         ahead = self._lookahead * self._rate * NANOSECONDS
-        self._progress = stamp if self._progress is None else self._progress
-        while stamp - self._progress > ahead and not self._stop.is_set():
+        self._progress = at if self._progress is None else self._progress
+        while at - self._progress > ahead and not self._stop.is_set():
             self._full.set()
             time.sleep(0.002)
         while not self._stop.is_set():

@@ -9,13 +9,14 @@ model stays the only place where names, defaults and limits are written down.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import difflib
 import sys
 from typing import Any, get_args, get_origin, Literal, TypeVar
 
 from continuum_loc.errors import SettingsError
 from continuum_loc.settings import parse_settings, Settings
+from continuum_loc.yaml_files import check_parameter_file, is_octal, OCTAL
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -32,6 +33,20 @@ S = TypeVar('S', bound=Settings)
 # Parameters that rclpy itself declares or understands.
 _ROS_NAMES = ('use_sim_time', 'start_type_description_service')
 _ROS_PREFIXES = ('qos_overrides.',)
+
+
+def check_arguments(arguments: Sequence[str]) -> None:
+    """
+    Refuse parameters that ROS reads otherwise than they are meant.
+
+    ROS takes 015 for 13, and of two equal keys in a file the last. Raises SettingsError naming the
+    file and the line, or the argument.
+    """
+    for option, value in zip(arguments, arguments[1:], strict=False):
+        if option == '--params-file':
+            check_parameter_file(value)
+        elif option in ('-p', '--param') and is_octal(value.partition(':=')[2]):
+            raise SettingsError(f'{option} {value}: {OCTAL}')
 
 
 def declare(node: Node, defaults: S, prefix: str = '') -> S:

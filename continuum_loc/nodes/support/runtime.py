@@ -13,9 +13,11 @@ import sys
 import tempfile
 import threading
 from typing import Any
+from weakref import WeakSet
 
-from continuum_loc.errors import ContinuumLocError
+from continuum_loc.errors import ContinuumLocError, SettingsError
 from continuum_loc.nodes.support.parameters import (
+    check_arguments,
     declare,
     guard,
     live_fields,
@@ -32,11 +34,15 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 
 BAD_INPUT = 2
 HEARTBEAT = 0.2  # s
+GRACE = 0.2  # s; in which a node that is being made may end by itself when it is told to stop
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+_nodes: WeakSet[PackageNode] = WeakSet()  # of this process, also those that are still being made
 
 
 class PackageNode(Node):
@@ -44,7 +50,9 @@ class PackageNode(Node):
 
     def __init__(self, name: str, defaults: Settings, **options: Any) -> None:
         super().__init__(name, **options)
+        _nodes.add(self)
         self.finished = Future()
+        self.failure: Exception | None = None
         self.settings = declare(self, defaults)
         self._guarded = False
 
@@ -52,6 +60,27 @@ class PackageNode(Node):
         """End the spin of this node (from any thread)."""
         if not self.finished.done():
             self.finished.set_result(None)
+
+    def fail(self, error: Exception) -> None:
+        """End the node with an error (from any thread); the first one counts."""
+        self.failure = self.failure or error
+        self.finish()
+
+    def thread(self, work: Callable[[], None], name: str) -> threading.Thread:
+        """
+        Make a thread whose failure is the node's, which ends then with an error.
+
+        A node that lives on without one of its threads is deaf or mute, and nobody knows.
+        """
+
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:
+                if self.context.ok():  # else it is the end that surfaces, as any of rclpy's errors
+                    self.fail(error)
+
+        return threading.Thread(target=guarded, name=name, daemon=True)
 
     def close(self) -> None:
         """Stop threads, write files. Called once, after the last callback."""
@@ -114,33 +143,94 @@ class PackageNode(Node):
 
 def run(make: Callable[[], PackageNode], args: list[str] | None = None) -> int:
     """
-    Make a node and spin it until it finishes or is told to stop.
+    Make a node, spin it until it finishes or is told to stop, and return the exit code.
 
-    Returns the exit code (2: bad input).
+    The code is 0, or 2 where something that was given cannot be used.
     """
     _provide_log_folder()
     try:
+        check_arguments(sys.argv if args is None else args)
         rclpy.init(args=args)
-    except RCLError as error:  # arguments after --ros-args that ROS does not understand
+    except (RCLError, SettingsError) as error:  # arguments that cannot be understood
         print(f'error: {error}', file=sys.stderr)
         return BAD_INPUT
-    node: PackageNode | None = None
+    node, failure = None, None
+    making = _Making(make)
     try:
-        node = make()
+        node = making.result()
         _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception as error:
         # A signal may surface as any of rclpy's errors, from a publish in flight for instance.
-        if rclpy.ok():
-            return _complain(error)
+        failure = error if rclpy.ok() else None
     finally:
         _ignore_signals()
         if node is not None:
-            node.close()
-            node.destroy_node()
+            failure = _closed(node, failure or node.failure)
         rclpy.try_shutdown()
-    return 0
+        making.abandon()
+    return 0 if failure is None else _complain(failure)
+
+
+def _closed(node: PackageNode, failure: Exception | None) -> Exception | None:
+    """Close a node that has failed or not; what went wrong, first."""
+    try:
+        node.close()
+    except Exception as error:
+        failure = failure or error
+    node.destroy_node()
+    return failure
+
+
+class _Making:
+    """
+    The making of a node in a thread of its own, while this one hears signals.
+
+    The first one on a machine compiles for a minute or two, most of it inside LLVM, and rclpy's
+    handler of signals only says that ROS is shut down, which nobody would look at meanwhile.
+    """
+
+    def __init__(self, make: Callable[[], PackageNode]) -> None:
+        self._make = make
+        self._node: PackageNode | None = None
+        self._error: BaseException | None = None
+        # Not the thread itself: one whose `join` a signal interrupted counts as ended.
+        self._done = threading.Event()
+        threading.Thread(target=self._work, name='making', daemon=True).start()
+
+    def result(self) -> PackageNode:
+        """
+        Wait for the node.
+
+        Raises what its making raised, or ExternalShutdownException when told to stop before.
+        """
+        while not self._done.wait(HEARTBEAT):
+            if not rclpy.ok():
+                raise ExternalShutdownException
+        if self._error is not None:
+            raise self._error
+        return self._node
+
+    def abandon(self) -> None:
+        """End the process where the node is still being made: nothing else ends a compilation."""
+        sys.setswitchinterval(1e-4)  # the other thread computes, and this one is in a hurry
+        if self._done.wait(GRACE):
+            return
+        for node in _nodes:  # so that nothing of theirs is left on the graph
+            node.destroy_node()
+        rclpy.get_default_context().destroy()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+
+    def _work(self) -> None:
+        try:
+            self._node = self._make()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._done.set()
 
 
 def _spin(node: PackageNode) -> None:
@@ -188,11 +278,16 @@ def _provide_log_folder() -> None:
         os.environ['ROS_LOG_DIR'] = tempfile.gettempdir()
 
 
+def deserialized(data: bytes, type_name: str) -> Any:
+    """Return the rclpy message of a type such as `sensor_msgs/msg/Imu` that was taken raw."""
+    return deserialize_message(data, ros_messages().resolve(type_name))
+
+
 def input_qos(topic: Topic, reliable: bool) -> QoSProfile:
     """
-    Best effort hears reliable and best-effort publishers alike.
+    Quality of service of an input: best effort hears every publisher.
 
-    The depth bridges a slow moment.
+    The depth of its queue bridges a slow moment of the node.
     """
     reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=topic.depth, reliability=reliability)

@@ -139,6 +139,15 @@ class RecorderNodeSettings(Settings):
     summary_file: str = Field(
         '', description='JSON file of message counts, written at the end; empty for none'
     )
+    largest_message: int = Field(
+        32_000_000, ge=1_000, description='a longer message is dropped [bytes]'
+    )
+    queue_messages: int = Field(
+        100_000, ge=100, description='most messages that wait to be written; others are dropped'
+    )
+    queue_bytes: int = Field(
+        256_000_000, ge=1_000_000, description='most bytes that wait to be written'
+    )
 
 
 class ReplayerNodeSettings(Settings):
@@ -190,6 +199,7 @@ class DriverNodeSettings(Settings):
     core_radius: float = Field(
         35e-6, gt=0.0, description="distance of the outer cores from the fibre's axis [m]"
     )
+    longest_line: int = Field(65_536, ge=256, description='a longer line is refused [bytes]')
 
 
 class ViewerNodeSettings(Settings):
@@ -200,8 +210,14 @@ class ViewerNodeSettings(Settings):
     )
     port: int = Field(8765, ge=0, le=65535, description='port to serve on; 0 takes a free one')
     map_points: int = Field(
-        20_000, ge=0, description='most map points that are sent to the browser'
+        20_000, ge=0, le=500_000, description='most map points that are sent to the browser'
     )
     cloud_points: int = Field(
-        5_000, ge=0, description='most reconstructed points that are sent to the browser'
+        5_000,
+        ge=0,
+        le=100_000,
+        description='most points of anything else that are sent to the browser',
+    )
+    largest_message: int = Field(
+        32_000_000, ge=1_000, description='a longer message is not shown [bytes]'
     )

@@ -13,14 +13,15 @@ import gc
 from queue import SimpleQueue
 import threading
 import time
-import traceback
-from typing import Any, TypeVar
+from typing import Any
 
-from continuum_loc.intake import Early, Inbox, Intake, Queued
+from continuum_loc.intake import Intake
 from continuum_loc.measurements import Measurement, NANOSECONDS
+from continuum_loc.nodes.support.inbox import Early, Inbox, Queued
 from continuum_loc.nodes.support.parameters import live_fields
 from continuum_loc.nodes.support.runtime import (
     Delays,
+    deserialized,
     input_qos,
     output_qos,
     PackageNode,
@@ -33,8 +34,6 @@ from msg_tools.factory import ros_messages
 from msg_tools.records import DiagnosticsRecord
 from msg_tools.topics import topic_spec, TRACKER
 import numpy as np
-
-T = TypeVar('T')
 
 OK, WARN, ERROR, STALE = range(4)
 POLL = 0.1  # s; how often an idle worker looks whether it has to stop
@@ -57,18 +56,21 @@ class WorkerNode(PackageNode):
         super().__init__(name, defaults, **options)
         self.robot = load_robot(self.settings.robot)
         self.inbox = Inbox(self.settings.intake)
-        self.early = Early(CLOCK_PATIENCE)
+        self.early = Early(CLOCK_PATIENCE, self.settings.intake.queue_bytes)
         self.intake = Intake(
-            self.robot, self.settings.intake, self._report, self.settings.frame_prefix
+            self.robot,
+            self.settings.intake,
+            self._report,
+            self.settings.frame_prefix,
+            restart=lambda: self.restart(),
         )
         self.latency, self.lag, self.step = Delays(), Delays(), Delays()
-        self.failures = 0
         self.outputs: dict[str, Any] = {}
         self._stop = threading.Event()
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._received_at = 0.0
         self._told: dict[str, int] = {}
-        self._thread = threading.Thread(target=self._work, name=f'{name} worker', daemon=True)
+        self._thread = self.thread(self._work, f'{name} worker')
 
     # ------------------------------------------------ for subclasses
 
@@ -114,6 +116,7 @@ class WorkerNode(PackageNode):
                 topic,
                 partial(self._receive, topic),
                 input_qos(spec, self.settings.intake.reliable_inputs),
+                raw=True,
             )
         self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
         # What was loaded and compiled stays: to go through it again and again, as the collector
@@ -136,13 +139,9 @@ class WorkerNode(PackageNode):
 
         Refused by class of error, dropped by topic.
         """
-        return {
+        return self.intake.counts() | {
             'received': dict(self.inbox.received),
-            'used': dict(self.intake.used),
-            'refused': dict(self.intake.refused),
             'dropped': dict(self.inbox.dropped),
-            'restarts': self.intake.gate.restarts,
-            'failures': self.failures,
         }
 
     def in_worker(self, task: Callable[[], None]) -> None:
@@ -181,26 +180,24 @@ class WorkerNode(PackageNode):
         )
         return [topic for topic in self.inputs if topic != TRACKER] + trackers
 
-    def _receive(self, topic: str, message: Any) -> None:
+    def _receive(self, topic: str, data: bytes) -> None:
         self._received_at = time.monotonic()
-        self.inbox.put(topic, message, self.now())
+        message = self.intake.parse(topic, data, deserialized)
+        if message is None:
+            self.inbox.received[topic] += 1
+        else:
+            self.inbox.put(topic, message, self.now(), len(data))
 
     # ------------------------------------------------ estimation (worker thread)
 
     def _work(self) -> None:
-        try:
-            while not self._stop.is_set():
-                leisure = not len(self.inbox) and self._attempt(self.idle, 'what it had seen')
-                queued = self.inbox.take(0.0 if leisure else POLL)
-                while not self._tasks.empty():
-                    self._tasks.get()()
-                for one in self._timely(queued):
-                    self._handle(one)
-        except Exception:
-            if self.context.ok() and not self._stop.is_set():
-                self.get_logger().fatal(f'the worker failed:\n{traceback.format_exc()}')
-                self.failures += 1
-            self.finish()
+        while not self._stop.is_set():
+            leisure = not len(self.inbox) and self.intake.attempt(self.idle, 'what it had seen')
+            queued = self.inbox.take(0.0 if leisure else POLL)
+            while not self._tasks.empty():
+                self._tasks.get()()
+            for one in self._timely(queued):
+                self._handle(one)
 
     def _timely(self, queued: Queued | None) -> list[Queued]:
         """Messages whose turn it is: `queued`, unless a simulated clock is behind it."""
@@ -210,33 +207,13 @@ class WorkerNode(PackageNode):
         return self.early.timely(new, self.now(), self.settings.intake.future_tolerance)
 
     def _handle(self, queued: Queued) -> None:
-        restarts = self.intake.gate.restarts
         measurement = self.intake.accept(queued.topic, queued.message, queued.arrival)
-        if self.intake.gate.restarts != restarts:
-            self.get_logger().warning(
-                'time went backward: the data starts again, and so does the estimate'
-            )
-            self.restart()
         if measurement is None:
             return
         begin = time.perf_counter()
-        stamp = self._attempt(lambda: self.consume(measurement), queued.topic)
+        stamp = self.intake.attempt(lambda: self.consume(measurement), queued.topic)
         if stamp is not None:
             self._note(stamp, queued, time.perf_counter() - begin)
-
-    def _attempt(self, action: Callable[[], T], what: str) -> T | None:
-        """Do `action`; a failure on what it was given is counted, and the estimate starts anew."""
-        try:
-            return action()
-        except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-            self.failures += 1
-            self.intake.refuse(
-                'failure',
-                f'the estimator failed on {what} ({type(error).__name__}: {error}) '
-                'and starts anew',
-            )
-            self.restart()
-            return None
 
     def _note(self, stamp: int, queued: Queued, seconds: float) -> None:
         self.step.add(seconds)
@@ -260,7 +237,8 @@ class WorkerNode(PackageNode):
         return reason
 
     def _report(self, kind: str, text: str) -> None:
-        self.get_logger().warning(f"{text} [further cases of '{kind}' are only counted]")
+        more = '' if kind == 'restart' else f" [further cases of '{kind}' are only counted]"
+        self.get_logger().warning(text + more)
 
     def _publish_diagnostics(self) -> None:
         level, text, values = self.describe()
@@ -285,7 +263,7 @@ class WorkerNode(PackageNode):
         lost = {
             'dropped': sum(self.inbox.dropped.values()),
             'refused': sum(self.intake.refused.values()),
-            'failures': self.failures,
+            'failures': self.intake.failures,
         }
         new = {
             key: count - self._told.get(key, 0)

@@ -1,15 +1,23 @@
-"""From columns and their covariances to what is published: the body at any instant and place."""
+"""The body at any instant and place, from columns and their covariances."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from continuum_loc import lie_kernels
+from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.state import Column, Grid, NODE_DIM, POSE_PART, VELOCITY_PART
-from numba import njit
+from continuum_loc.estimator.state import (
+    Column,
+    ends_along,
+    ends_in_time,
+    Grid,
+    NODE_DIM,
+    POSE_PART,
+    VELOCITY_PART,
+)
 import numpy as np
 
+_WORK = gp.new_workspace()  # of kernels that run one at a time, and leave nothing in it
 MOTION = np.array([0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])  # a node's pose and velocity rows
 
 
@@ -43,24 +51,34 @@ def body_between(a: Column, b: Column, time: float) -> Body:
 
     Pose and velocity by the Gaussian process's cubic Hermite, strain linearly.
     """
-    nodes, d = len(a.T), b.time - a.time
-    T, velocity = np.empty((nodes, 4, 4)), np.empty((nodes, 6))
-    _interpolate(
-        a.T,
-        a.velocity,
-        b.T,
-        b.velocity,
-        d,
-        np.full(nodes, time - a.time),
-        np.arange(nodes),
-        np.arange(nodes),
-        T,
-        velocity,
-        np.empty((0, 6, 24)),
-        np.empty((0, 6, 24)),
+    nodes, u = np.arange(len(a.T)), (time - a.time) / (b.time - a.time)
+    found = interpolated(a, b, np.full(len(nodes), time - a.time), nodes)
+    return Body(found.T, (1.0 - u) * a.strain + u * b.strain, found.v)
+
+
+def interpolated(
+    a: Column,
+    b: Column,
+    tau: np.ndarray,
+    nodes: np.ndarray,
+    pose: bool = False,
+    rate: bool = False,
+) -> gp.Instant:
+    """
+    States of `nodes` (m,) at times tau (m,) after column a, each field with m in front.
+
+    The Jacobians, of the pose and of the rate as asked for, are by [delta_a, v_a, delta_b, v_b] of
+    the node.
+    """
+    m = len(nodes)
+    out = gp.Instant(
+        np.empty((m, 4, 4)),
+        np.empty((m, 6)),
+        np.empty((m if pose else 0, 6, 24)),
+        np.empty((m if rate else 0, 6, 24)),
     )
-    u = (time - a.time) / d
-    return Body(T, (1.0 - u) * a.strain + u * b.strain, velocity)
+    _interpolate(a, b, tau, nodes, out, _WORK)
+    return out
 
 
 def blended_step(step_a: np.ndarray, step_b: np.ndarray, d: float, tau: float) -> np.ndarray:
@@ -79,33 +97,6 @@ def blended_step(step_a: np.ndarray, step_b: np.ndarray, d: float, tau: float) -
     )
 
 
-def interpolated_poses(
-    a: Column, b: Column, tau: np.ndarray, nodes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Poses (m, 4, 4) of `nodes` (m,) at times tau (m,) after column a, and their Jacobians.
-
-    The Jacobians (m, 6, 24) are by [delta_a, v_a, delta_b, v_b] of the node.
-    """
-    m = len(nodes)
-    T, J_pose = np.empty((m, 4, 4)), np.empty((m, 6, 24))
-    _interpolate(
-        a.T,
-        a.velocity,
-        b.T,
-        b.velocity,
-        b.time - a.time,
-        tau,
-        nodes,
-        nodes,
-        T,
-        np.empty((m, 6)),
-        J_pose,
-        np.empty((m, 6, 24)),
-    )
-    return T, J_pose
-
-
 def motion_jacobians(
     a: Column, b: Column, time: float, nodes: np.ndarray, dim: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -114,22 +105,9 @@ def motion_jacobians(
 
     They are by the offsets of the two columns.
     """
-    m, d, tau = len(nodes), b.time - a.time, time - a.time
-    J = np.empty((m, 12, 24))
-    _interpolate(
-        a.T,
-        a.velocity,
-        b.T,
-        b.velocity,
-        d,
-        np.full(m, tau),
-        nodes,
-        nodes,
-        np.empty((m, 4, 4)),
-        np.empty((m, 6)),
-        J[:, :6],
-        J[:, 6:],
-    )
+    m = len(nodes)
+    found = interpolated(a, b, np.full(m, time - a.time), nodes, pose=True, rate=True)
+    J = np.concatenate([found.J_pose, found.J_rate], axis=1)
     out = np.zeros((2, m, 12, dim))
     for i, node in enumerate(nodes):
         out[:, i, :, NODE_DIM * node + MOTION] = J[i].reshape(12, 2, 12).transpose(2, 1, 0)
@@ -142,9 +120,8 @@ def motion_bridge(a: Column, b: Column, time: float, velocity_psd: np.ndarray) -
 
     velocity_psd: (m, 6) process noise of the nodes.
     """
-    open_bridge = np.empty((2, 2))
-    gp.bridge(time - a.time, b.time - a.time, open_bridge)
-    return np.kron(open_bridge, velocity_psd[:, :, None] * np.eye(6))
+    open_ = gp.bridge(time - a.time, b.time - a.time)
+    return np.kron(open_, velocity_psd[:, :, None] * np.eye(6))
 
 
 def rattle_covariance(s_imu: np.ndarray, turns: np.ndarray, s: np.ndarray) -> np.ndarray:
@@ -160,7 +137,7 @@ def rattle_covariance(s_imu: np.ndarray, turns: np.ndarray, s: np.ndarray) -> np
     return covariance
 
 
-@njit(cache=True)
+@kernel
 def _rattle(s_imu, turns, s, covariance):
     at, turn, shift = (
         np.zeros(len(s_imu) + 1),
@@ -176,40 +153,33 @@ def _rattle(s_imu, turns, s, covariance):
     covariance[:, 2, 2] = np.square(np.interp(s, at, shift[1]))
 
 
-@njit(cache=True)
-def _interpolate(T_a, v_a, T_b, v_b, d, tau, from_a, from_b, T, v, J_pose, J_rate):
-    """
-    `gp.hermite` for many: element m goes from T_a[from_a[m]] to T_b[from_b[m]] at tau[m].
-
-    The Jacobians are written where J_pose has room.
-    """
-    W, V, M = lie_kernels.workspace()
-    rows = 6 if J_pose.shape[0] > 0 else 0
-    J_work, pose, rate = np.empty((2, 6, 24)), np.empty((rows, 24)), np.empty((rows, 24))
+@kernel
+def _interpolate(a, b, tau, nodes, out, work):
+    pose, rate = out.J_pose.shape[0] > 0, out.J_rate.shape[0] > 0
     for m in range(tau.shape[0]):
-        a, b = from_a[m], from_b[m]
-        gp.hermite(
-            T_a[a], v_a[a], T_b[b], v_b[b], d, tau[m], T[m], v[m], pose, rate, W, V, M, J_work
-        )
-        if m < J_pose.shape[0]:
-            J_pose[m] = pose
-            J_rate[m] = rate
+        gp.relate(ends_in_time(a, b, nodes[m]), work)
+        gp.evaluate(work, tau[m], pose, 0 if rate else 6)
+        at = work[0]
+        out.T[m], out.v[m] = at.T, at.v
+        if pose:
+            out.J_pose[m] = at.J_pose
+        if rate:
+            out.J_rate[m] = at.J_rate
 
 
 def backbone(grid: Grid, T: np.ndarray, strain: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Poses (B, 4, 4) at arclengths s (B,) of a body with nodes T (N, 4, 4) and strain (N, 6)."""
     out = np.empty((len(s), 4, 4))
-    _backbone(T, strain, grid.s, *grid.segments(s), out)
+    _backbone(T, strain, grid.s, *grid.segments(s), out, _WORK)
     return out
 
 
-@njit(cache=True)
-def _backbone(T, strain, s, segments, offsets, out):
-    W, V, M = lie_kernels.workspace()
+@kernel
+def _backbone(T, strain, s, segments, offsets, out, work):
     related = -1
     for m in range(segments.shape[0]):
-        n = segments[m]
-        if n != related:
-            gp.relate(T[n], T[n + 1], strain[n + 1], W, V, M)
-            related = n
-        gp.pose_at(T[n], strain[n], s[n + 1] - s[n], offsets[m], out[m], V, M)
+        if segments[m] != related:
+            related = segments[m]
+            gp.relate(ends_along(T, strain, s, related), work)
+        gp.pose_at(work, offsets[m])
+        out[m] = work[0].T

@@ -1,0 +1,137 @@
+"""
+Trials in a world that departs from the estimator's files: the true world, and the scanned map.
+
+The estimator gets the nominal robot, its own settings, the samples and the map; nothing else of
+what is drawn here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from continuum_loc.mapping.build import local_shape
+from continuum_loc.mapping.map_files import load_map
+from continuum_loc.mapping.prior_map import PriorMap
+from continuum_loc.robot import RobotDescription
+from continuum_loc.simulator.departures import (
+    Departures,
+    magnet_error,
+    Scan,
+    sensor_departures,
+    stream_of,
+    tof_settings,
+    true_plant,
+    true_robot,
+)
+import numpy as np
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from continuum_loc.simulator.scene import Scene
+    from continuum_loc.simulator.world import World
+
+
+def true_world(
+    robot: RobotDescription,
+    scene: Scene | None,
+    trajectory: str,
+    departures: Departures,
+    *,
+    seed: int,
+    fidelity: str = 'paper',
+    plant: str | Path | None = None,
+    profile: str = 'live',
+    faults: tuple = (),
+) -> World:
+    """
+    Make the world as it truly is, of a robot as it is described.
+
+    The drives pull as the nominal plant has it: what the true one does with that is its own.
+    """
+    from continuum_loc.simulator.plant import load_plant
+    from continuum_loc.simulator.trajectories import trajectory as path_of
+    from continuum_loc.simulator.world import World
+
+    fidelity, nominal = departures.fidelity(fidelity), load_plant(plant or robot.name)
+    return World(
+        true_robot(robot, departures, seed),
+        scene,
+        path_of(trajectory, robot, nominal),
+        plant=true_plant(nominal, departures, seed),
+        profile=profile,
+        tof_fidelity=fidelity,
+        tof_settings=tof_settings(departures, fidelity),
+        T_magnet_true=magnet_error(departures, seed),
+        seed=seed,
+        faults=(*faults, *sensor_departures(robot, departures, fidelity, seed)),
+    )
+
+
+def scanned_map_file(nominal: Path, departures: Departures, seed: int) -> Path:
+    """
+    Name the file of the map that the estimator is given in place of the `nominal` one.
+
+    It lies beside it, made once for each seed.
+    """
+    said = f'{departures.scan!r} {departures.map_frame!r} {seed}'
+    digest = hashlib.sha256(said.encode()).hexdigest()[:12]
+    path = nominal.with_name(f'{nominal.stem}-scanned-{digest}.npz')
+    if not path.is_file():
+        partial = path.with_name(f'{path.stem}.{os.getpid()}.npz')
+        scanned(load_map(nominal), departures, seed).save(partial)
+        partial.replace(path)  # atomic: another process sees all of it or nothing
+    return path
+
+
+def scanned(prior: PriorMap, departures: Departures, seed: int) -> PriorMap:
+    """Make of a map what a scanner makes of the place, in a frame that is a little off."""
+    if departures.scan:
+        prior = _scan(prior, departures.scan, stream_of(seed, 'scan'))
+    if departures.map_frame:
+        T = departures.map_frame.drawn(stream_of(seed, 'map_frame'))
+        prior = _moved(prior, T)
+    return prior
+
+
+def _scan(prior: PriorMap, scan: Scan, rng: np.random.Generator) -> PriorMap:
+    """
+    Points with noise and without holes; normals and planarity by PCA of what is left.
+
+    The scanner knows on which side of the surface it stood, and its noise is in its data sheet.
+    """
+    centres = prior.points[rng.integers(len(prior), size=scan.holes)]
+    kept = np.ones(len(prior), bool)
+    for near in cKDTree(prior.points).query_ball_point(centres, scan.hole_radius):
+        kept[near] = False
+    normals = prior.normals[kept]
+    points = prior.points[kept] + scan.noise * rng.standard_normal((kept.sum(), 3))
+    planarity, found = local_shape(points, normals)
+    found = np.where(np.einsum('ij,ij->i', found, normals) < 0.0, -1.0, 1.0)[:, None] * found
+    return PriorMap(
+        points,
+        found,
+        planarity,
+        sigma=max(scan.noise, prior.sigma),
+        spacing=prior.spacing,
+        oriented=prior.oriented,
+        source=prior.source,
+        seed=prior.seed,
+    )
+
+
+def _moved(prior: PriorMap, T: np.ndarray) -> PriorMap:
+    """Turn the map about its middle, and shift it."""
+    middle = prior.points.mean(axis=0)
+    return PriorMap(
+        (prior.points - middle) @ T[:3, :3].T + middle + T[:3, 3],
+        prior.normals @ T[:3, :3].T,
+        prior.planarity,
+        sigma=prior.sigma,
+        spacing=prior.spacing,
+        oriented=prior.oriented,
+        source=prior.source,
+        seed=prior.seed,
+    )

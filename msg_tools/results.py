@@ -1,0 +1,175 @@
+"""ROS messages of what an estimate is published as <-> `msg_tools.records`, both ways."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from continuum_loc.measurements import TruthSample
+from msg_tools.clouds import cloud_array, columns_cloud
+from msg_tools.factory import Messages
+from msg_tools.geometry import (
+    body_covariance,
+    header_message,
+    MAP,
+    pose_message,
+    pose_messages,
+    require_map,
+    ros_covariance,
+    stamp_of,
+    transforms_of,
+    vector,
+    vector_message,
+)
+from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord, TipRecord
+import numpy as np
+
+
+def poses_message(make: Messages, stamp: int, T_map_body: np.ndarray) -> Any:
+    """Write a PoseArray in `map` of (N, 4, 4)."""
+    return make(
+        'geometry_msgs/msg/PoseArray',
+        header=header_message(make, stamp, MAP),
+        poses=pose_messages(make, T_map_body),
+    )
+
+
+def poses_record(message: Any, where: str = 'poses') -> PosesRecord:
+    """Read the poses of a PoseArray in `map`."""
+    require_map(message.header, where)
+    return PosesRecord(stamp_of(message.header, where), transforms_of(message.poses, where))
+
+
+def truth_sample(message: Any, where: str = 'ground_truth/poses') -> TruthSample:
+    """Read the true ring poses of a PoseArray in `map`."""
+    record = poses_record(message, where)
+    return TruthSample(record.stamp, record.T_map_body)
+
+
+def path_message(make: Messages, stamp: int, T_map_backbone: np.ndarray) -> Any:
+    """Path in `map` of (B, 4, 4)."""
+    header = header_message(make, stamp, MAP)
+    poses = [
+        make('geometry_msgs/msg/PoseStamped', header=header, pose=pose)
+        for pose in pose_messages(make, T_map_backbone)
+    ]
+    return make('nav_msgs/msg/Path', header=header, poses=poses)
+
+
+def path_record(message: Any, where: str = 'backbone') -> PathRecord:
+    """Read the transforms of a Path in `map`."""
+    require_map(message.header, where)
+    T = transforms_of([item.pose for item in message.poses], where)
+    return PathRecord(stamp_of(message.header, where), T)
+
+
+def tip_message(make: Messages, tip: TipRecord, child_frame: str) -> Any:
+    """
+    Odometry: pose and its covariance in `map`, twist and its in the tip's own frame.
+
+    REP-103.
+    """
+    covariance = ros_covariance(tip.covariance, tip.T_map_tip[:3, :3])
+    twist = make(
+        'geometry_msgs/msg/Twist',
+        linear=vector_message(make, tip.velocity[:3]),
+        angular=vector_message(make, tip.velocity[3:]),
+    )
+    return make(
+        'nav_msgs/msg/Odometry',
+        header=header_message(make, tip.stamp, MAP),
+        child_frame_id=child_frame,
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(make, tip.T_map_tip),
+            covariance=covariance,
+        ),
+        twist=make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=twist,
+            covariance=np.ascontiguousarray(tip.velocity_covariance, float).reshape(36),
+        ),
+    )
+
+
+def tip_record(message: Any, where: str = 'tip') -> TipRecord:
+    """Read the tip of an Odometry message in `map`."""
+    require_map(message.header, where)
+    T = transforms_of([message.pose.pose], where)[0]
+    velocity = np.concatenate(
+        [vector(message.twist.twist.linear), vector(message.twist.twist.angular)]
+    )
+    velocity_covariance = np.array(message.twist.covariance, float).reshape(6, 6)
+    return TipRecord(
+        stamp_of(message.header, where),
+        T,
+        body_covariance(message.pose.covariance, T[:3, :3], where),
+        velocity,
+        velocity_covariance,
+    )
+
+
+def columns_message(make: Messages, cloud: CloudRecord, frame_id: str = MAP) -> Any:
+    """PointCloud2 of named columns, float32."""
+    return columns_cloud(make, header_message(make, cloud.stamp, frame_id), cloud.fields)
+
+
+def cloud_record(message: Any, where: str = 'cloud') -> CloudRecord:
+    """All columns of a PointCloud2 in `map`; it may be empty."""
+    require_map(message.header, where)
+    stamp = stamp_of(message.header, where)
+    if message.width * message.height == 0:
+        return CloudRecord(stamp, {item.name: np.empty(0) for item in message.fields})
+    array = cloud_array(message, where).reshape(-1)
+    return CloudRecord(stamp, {name: array[name].copy() for name in array.dtype.names})
+
+
+def map_record(stamp: int, prior_map: Any) -> CloudRecord:
+    """Read the columns of `prior_map`: points, normals and planarity of a PriorMap."""
+    values = np.column_stack([prior_map.points, prior_map.normals, prior_map.planarity])
+    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z', 'planarity')
+    return CloudRecord(stamp, dict(zip(names, values.T, strict=True)))
+
+
+def diagnostics_message(make: Messages, record: DiagnosticsRecord) -> Any:
+    """DiagnosticArray."""
+    statuses = []
+    for name, level, text, values in record.statuses:
+        pairs = [
+            make('diagnostic_msgs/msg/KeyValue', key=key, value=value)
+            for key, value in values.items()
+        ]
+        statuses.append(
+            make(
+                'diagnostic_msgs/msg/DiagnosticStatus',
+                level=_level(make, level),
+                name=name,
+                message=text,
+                hardware_id='',
+                values=pairs,
+            )
+        )
+    return make(
+        'diagnostic_msgs/msg/DiagnosticArray',
+        header=header_message(make, record.stamp, ''),
+        status=statuses,
+    )
+
+
+def _level(make: Messages, level: int) -> Any:
+    """Rclpy wants `byte` as bytes, rosbags as int: the constant of the class tells which."""
+    ok = make.resolve('diagnostic_msgs/msg/DiagnosticStatus').OK
+    return bytes([level]) if isinstance(ok, bytes) else level
+
+
+def diagnostics_record(message: Any, where: str = '/diagnostics') -> DiagnosticsRecord:
+    """Read the statuses of a DiagnosticArray."""
+    statuses = tuple(
+        (
+            item.name,
+            item.level[0] if isinstance(item.level, bytes) else int(item.level),
+            item.message,
+            {pair.key: pair.value for pair in item.values},
+        )
+        for item in message.status
+    )
+    return DiagnosticsRecord(stamp_of(message.header, where), statuses)
