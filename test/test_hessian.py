@@ -7,7 +7,7 @@ whole second derivative, so that it must be what the gradient changes by.
 """
 
 from continuum_loc import lie
-from continuum_loc.estimator.chain import Blocks, symmetric
+from continuum_loc.estimator.normal import Normal, symmetric
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import column_at_rest, Grid
 from continuum_loc.magnet import ring_field
@@ -39,13 +39,13 @@ def resting(strain: np.ndarray, T_map_base: np.ndarray):
 
 def normal_equations(kind: str, rows_and_times, a, b):
     """Symmetric H (2 D, 2 D) and g (2 D,) of the prior or of a factor between two columns."""
-    blocks = Blocks.zeros(GRID.dim)
+    normal = Normal.zeros(2 * GRID.dim)
     if kind == 'prior':
-        Priors(ROBOT, GRID, SETTINGS).add(blocks, a, b)
+        Priors(ROBOT, GRID, SETTINGS).add(normal, a, b)
     else:
         factor, rows, times = rows_and_times
-        factor.linearise(factor.stack(times, rows), a, b, blocks)
-    return symmetric(blocks.H), blocks.g.copy()
+        factor.linearise(factor.stack(times, rows), a, b, normal)
+    return symmetric(normal.H), normal.g.copy()
 
 
 def pose_of(a, ring: str) -> np.ndarray:
