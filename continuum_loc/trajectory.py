@@ -187,7 +187,8 @@ def known_at(reference: np.ndarray, stamps: np.ndarray, longest_gap: float) -> n
     after = np.clip(np.searchsorted(reference, stamps, side='right'), 1, len(reference) - 1)
     inside = (stamps >= reference[0]) & (stamps <= reference[-1])
     near = reference[after] - reference[after - 1] <= longest_gap * NANOSECONDS
-    return inside & (near | (stamps == reference[after - 1]))
+    sampled = (stamps == reference[after - 1]) | (stamps == reference[after])
+    return inside & (near | sampled)
 
 
 def save_tum(track: Trajectory, folder: str | Path, prefix: str) -> list[Path]:
