@@ -200,7 +200,9 @@ def figures(
                 label=kind,
             )
     axes[0].set_xticks(range(len(SHARES)), SHARES, rotation=60)
-    axes[0].set(ylabel='share [%], 10th to 90th percentile over flights', yscale='symlog', ylim=(0.0, None))
+    axes[0].set(
+        ylabel='share [%], 10th to 90th percentile over flights', yscale='symlog', ylim=(0.0, None)
+    )
     for kind, found in by_distance.items():
         if found:
             middle = [np.mean(band) for band in BANDS]
