@@ -744,3 +744,22 @@ def test_the_robot_of_the_documentation_is_simulated(tmp_path):
     )
     truth = [s.T_map_ring for s in world.run(4.0) if type(s) is TruthSample]
     assert np.linalg.norm(truth[-1][-1, :3, 3] - truth[0][-1, :3, 3]) > 0.1
+
+
+def test_real_tof_sensors_run_out_of_step_each_at_its_own_rate():
+    """Those of the paper share their instants; real ones start anywhere in a period of 1/15 s."""
+    from continuum_loc.simulator.scenes import load_scene
+
+    arm = load_robot('soft_arm')
+    world = World(arm, load_scene('R1'), 'b2', tof_fidelity='vl53l5cx', seed=3)
+    stamps = {sensor.name: [] for sensor in arm.tof}
+    for sample in world.run(2.0):
+        if isinstance(sample, TofFrame):
+            stamps[sample.sensor].append(sample.stamp)
+    first = np.array([times[0] for times in stamps.values()])
+    assert len(set(first)) == len(first) and np.ptp(first) > 0.02e9
+    for times in stamps.values():
+        steps = np.diff(times)
+        # One period, none (read out together), or two where a frame was waited for or lost.
+        assert np.all(steps >= 0) and np.median(steps) == pytest.approx(1e9 / 15.0, rel=0.02)
+        assert 27 <= len(times) <= 30

@@ -62,12 +62,16 @@ class Units:
     @classmethod
     def together(cls, units: Sequence[Units]) -> Units:
         """Put units side by side."""
+        if len(units) == 1:  # as in a stream of one sensor: nothing to copy
+            return units[0]
         return cls(
             *(np.concatenate([getattr(unit, f.name) for unit in units]) for f in fields(cls))
         )
 
     def apart(self) -> list[Units]:
         """Take them apart again, one unit each."""
+        if len(self.offset) == 1:
+            return [self]
         return [
             Units(*(getattr(self, f.name)[i : i + 1] for f in fields(self)))
             for i in range(len(self.offset))
