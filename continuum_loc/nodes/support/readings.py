@@ -150,7 +150,7 @@ def lines(source: int, stopped: Callable[[], bool], longest: int) -> Iterator[by
     Of a line of more than `longest` bytes only the beginning comes, itself longer than that: the
     rest is not kept. Raises RunFailure where the source fails, as a port does that is pulled out.
     """
-    rest, skipping = b'', False
+    rest, skipping, terminal = b'', False, os.isatty(source)
     while not stopped():
         if not select.select([source], [], [], POLL)[0]:
             continue
@@ -167,6 +167,8 @@ def lines(source: int, stopped: Callable[[], bool], longest: int) -> Iterator[by
             skipping = True
         rest = b'' if skipping else rest
         if not chunk:
+            if terminal and not os.isatty(source):  # it hung up; an end that was typed is one
+                raise RunFailure('the source is a port that has gone')
             break
     if rest.strip():
         yield rest
