@@ -12,9 +12,10 @@ import sys
 
 from continuum_loc.errors import BagError
 from continuum_loc.measurements import ImuSample
+from continuum_loc.offline.mcap_survivors import Survivors
 from continuum_loc.offline.repair import repair
 from msg_tools.bag import BagWriter, open_bag, read_bag
-from msg_tools.mcap import MAGIC, records, Survivors
+from msg_tools.mcap import MAGIC, records
 import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
@@ -100,13 +101,13 @@ def test_a_disk_that_is_full_to_the_last_byte_gives_up_the_last_piece(tmp_path):
     code = (
         'import resource, sys; from pathlib import Path; from msg_tools.mcap import close_cut; '
         'limit = int(sys.argv[2]); resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)); '
-        'print(close_cut(Path(sys.argv[1]))[0].total())'
+        'close_cut(Path(sys.argv[1]))'
     )
     file.write_bytes(file.read_bytes()[: ends[4]])  # five pieces, and not a byte more
     done = subprocess.run(
         [sys.executable, '-c', code, str(file), str(ends[4])], capture_output=True, text=True
     )
-    assert done.stdout == '4\n', done.stderr
+    assert done.returncode == 0, done.stderr
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     assert samples(tmp_path / 'bag') == 4  # one file without metadata is a bag too
 

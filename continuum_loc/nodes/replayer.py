@@ -20,8 +20,8 @@ from continuum_loc.nodes.support.pacing import Paced
 from continuum_loc.nodes.support.runtime import output_qos, PackageNode, run
 from continuum_loc.nodes.support.settings import ReplayerNodeSettings
 from msg_tools.bag import contract_topics, open_bag, raw_messages
-from msg_tools.convert import time_message
 from msg_tools.factory import ros_messages
+from msg_tools.geometry import time_message
 from msg_tools.topics import INPUTS, topic_spec, TOPICS, TRACKER
 from rosgraph_msgs.msg import Clock
 
