@@ -25,6 +25,7 @@ from rclpy.qos import DurabilityPolicy
 # [s] trackers are found on the graph, as only the robot description could name them before.
 WATCH_PERIOD = 0.5
 POLL = 0.1
+MOST_TOPICS = 256
 FLUSHED = 1.0  # s; what a recorder that is killed loses at most
 
 
@@ -103,7 +104,7 @@ class RecorderNode(PackageNode):
                 or not split[1].startswith(TRACKER)
             ):
                 continue
-            if split[1] not in self._subscribed:
+            if split[1] not in self._subscribed and len(self._subscribed) < MOST_TOPICS:
                 self._subscribe(split[1])
 
     def _receive(self, topic: str, data: bytes) -> None:
