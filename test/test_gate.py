@@ -306,7 +306,8 @@ def test_a_bag_that_is_damaged_further_on_is_used_up_to_there(tmp_path):
         chunks = [end for code, _, end, _ in records(stream) if code == 6]
     assert len(chunks) > 1
     data = bytearray(file.read_bytes())
-    data[chunks[0] + 200 : chunks[0] + 100_000] = b'\xff' * 99_800  # in what follows the first
+    inside = slice(chunks[0] + 200, chunks[0] + 100_000)  # of what follows the first
+    data[inside] = b'\xff' * 99_800
     file.write_bytes(data)
     found = replay(bag, NoisyFilter(ROBOT))
     used = found.counts['intake']['used']['imu/data_raw']

@@ -81,7 +81,8 @@ class Survivors:
         """Messages of a chunk; of the last one, which may be cut, as many as there are."""
         begin, end, size, crc = unpack_from('<QQQI', content)
         (packing,) = _strings(content, 28, 1)
-        data = content[28 + 4 + len(packing) + 8 :]
+        begins = 28 + 4 + len(packing) + 8
+        data = content[begins:]
         if size > LARGEST_CHUNK:
             raise ValueError(f'a chunk of {size} bytes')
         data = _unpack(packing.decode(), data, size)
@@ -97,10 +98,11 @@ def _strings(content: bytes, place: int, count: int) -> list[bytes]:
     found = []
     for _ in range(count):
         (length,) = unpack_from('<I', content, place)
-        found.append(content[place + 4 : place + 4 + length])
+        place, end = place + 4, place + 4 + length
+        found.append(content[place:end])
         if len(found[-1]) < length:
             raise EOFError
-        place += 4 + length
+        place = end
     return found
 
 
