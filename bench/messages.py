@@ -21,7 +21,7 @@ from typing import Any
 
 from bench.harness import one_core, side_by_side
 from continuum_loc.measurements import TOF_VALID, TofFrame
-from msg_tools import convert
+from msg_tools import convert, geometry, results
 from msg_tools.clouds import DATATYPES
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
@@ -42,7 +42,7 @@ def run(quick: bool = False) -> list[dict]:
 
 def _frame_rows(repeats: int) -> list[dict]:
     peer, make, frame = _peer(), ros_messages(), _frame()
-    header = convert.header_message(make, frame.stamp, frame.sensor)
+    header = geometry.header_message(make, frame.stamp, frame.sensor)
     message = convert.tof_message(make, frame)
     fields = message.fields
     columns = (*frame.points.T, frame.ranges, frame.sigma, frame.status)
@@ -91,7 +91,7 @@ def _map_rows(repeats: int) -> list[dict]:
     peer, make = _peer(), ros_messages()
     values = np.random.default_rng(0).normal(size=(MAP_POINTS, len(MAP_COLUMNS)))
     record = CloudRecord(1, dict(zip(MAP_COLUMNS, values.T, strict=True)))
-    message = convert.columns_message(make, record)
+    message = results.columns_message(make, record)
     single = values.astype(np.float32)
 
     def written() -> Any:
@@ -110,13 +110,13 @@ def _map_rows(repeats: int) -> list[dict]:
     return [
         side_by_side(
             'message, map written',
-            lambda: convert.columns_message(make, record),
+            lambda: results.columns_message(make, record),
             PEER,
             written,
             repeats,
         ),
         side_by_side(
-            'message, map read', lambda: convert.cloud_record(message), PEER, read, repeats
+            'message, map read', lambda: results.cloud_record(message), PEER, read, repeats
         ),
     ]
 

@@ -36,6 +36,8 @@ import numpy as np
 from pydantic import Field
 
 T = TypeVar('T')
+LEAP_SPAN = 50_000_000  # ns
+RESTARTS_TOLD = 10  # the others are only counted
 END = 1e-6  # m; how far beyond the body's ends a station may be by rounding
 
 
@@ -84,9 +86,10 @@ class StampGate:
     `judge` returns None to use a sample, or the class of error under which it is refused. A sample
     that follows the last one of its own sensor is late, however far the others are: after a pause
     of the whole process, reception takes one topic after the other. A leap from both is believed
-    when `jump_confirmations` samples agree on it and none came meanwhile that does not leap. Then
-    it is a gap, which a motion prior bridges; but backward, as a looped bag leaps, or forward over
-    more than `longest_gap`, the data starts again, which `restarts` counts.
+    when `jump_confirmations` samples agree on it, for LEAP_SPAN of their time (the frames of one
+    cycle may share a clock of their own), and none came meanwhile that does not leap. Then it is
+    a gap, which a motion prior bridges; but backward, as a looped bag leaps, or forward over more
+    than `longest_gap`, the data starts again, which `restarts` counts.
     """
 
     def __init__(self, settings: IntakeSettings) -> None:
@@ -123,10 +126,19 @@ class StampGate:
         return self.newest is not None and all(abs(stamp - one) > tolerance for one in known)
 
     def _believed(self, stamp: int) -> bool:
-        tolerance = nanoseconds(self.settings.jump_tolerance)
+        """Whether enough leaping samples follow one another here, and not at one instant alone."""
         self._leaping.append(stamp)
-        agreeing = sum(abs(other - stamp) <= tolerance for other in self._leaping)
-        if agreeing < self.settings.jump_confirmations:
+        tolerance = nanoseconds(self.settings.jump_tolerance)
+        ordered = sorted(self._leaping)
+        low = high = ordered.index(stamp)
+        while low > 0 and ordered[low] - ordered[low - 1] <= tolerance:
+            low -= 1
+        while high < len(ordered) - 1 and ordered[high + 1] - ordered[high] <= tolerance:
+            high += 1
+        if (
+            high - low + 1 < self.settings.jump_confirmations
+            or ordered[high] - ordered[low] < LEAP_SPAN
+        ):
             return False
         if not 0 <= stamp - self.newest <= nanoseconds(self.settings.longest_gap):
             self.reset()
@@ -341,12 +353,12 @@ class Intake:
                 f'{(before or 0) / NANOSECONDS:.6f} s, clock {arrival / NANOSECONDS:.6f} s)',
             )
         if gate.restarts != restarts:
-            way = 'backward' if stamp < before else 'forward'
-            self._report(
-                'restart',
-                f'time went {way}, from {before / NANOSECONDS:.3f} to '
-                f'{stamp / NANOSECONDS:.3f} s: the data starts again, and so does the estimate',
-            )
+            if gate.restarts <= RESTARTS_TOLD:
+                self._report(
+                    'restart',
+                    f'time went from {before / NANOSECONDS:.3f} to {stamp / NANOSECONDS:.3f} s: '
+                    'the data starts again, and so does the estimate',
+                )
             self.restart()
 
     def _without_prefix(self, sample: Any) -> Any:

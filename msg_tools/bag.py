@@ -114,10 +114,13 @@ class BagWriter:
         with suppress(OSError):  # it still tries to write what it could not
             storage.bio.close()
         with self._failing():
-            left, self._writer.max_timestamp = close_cut(storage.path)
-        self.counts = Counter({topic: left[self._name(topic)] for topic in self.counts})
-        names = {connection.id: connection.topic for connection in self._connections.values()}
-        self._writer.counts = {number: left[name] for number, name in names.items()}
+            close_cut(storage.path)
+        with open_bag(storage.path) as reader:
+            left = {c.topic: c.msgcount for c in reader.connections}
+            self._writer.max_timestamp = reader.end_time - 1
+        for topic, connection in self._connections.items():
+            self.counts[topic] = left.get(connection.topic, 0)
+            self._writer.counts[connection.id] = self.counts[topic]
         self._writer.storage = _Closed(storage.path)
         with suppress(OSError):  # one file without metadata can be read too
             self._writer.close()

@@ -2,9 +2,8 @@
 ROS messages <-> `continuum_loc.measurements`, both ways.
 
 Works on rclpy's messages and on rosbags' alike: reading goes by attribute, and building is handed
-a `msg_tools.factory.Messages`. Which topic carries what is in `msg_tools.topics`. The converters
-of sensor messages are here; those of headers and poses (`geometry`) and of what an estimate is
-published as (`results`) can be had from here too.
+a `msg_tools.factory.Messages`. Which topic carries what is in `msg_tools.topics`. What an estimate
+is published as is in `msg_tools.results`, headers and poses in `msg_tools.geometry`.
 """
 
 from __future__ import annotations
@@ -38,62 +37,11 @@ from msg_tools.geometry import (
     require_map,
     ros_covariance,
     stamp_of,
-    time_message,
     transforms_of,
     vector,
     vector_message,
 )
-from msg_tools.results import (
-    cloud_record,
-    columns_message,
-    diagnostics_message,
-    diagnostics_record,
-    map_record,
-    path_message,
-    path_record,
-    poses_message,
-    poses_record,
-    tip_message,
-    tip_record,
-    truth_sample,
-)
 import numpy as np
-
-__all__ = [
-    'MAP',
-    'body_covariance',
-    'cloud_record',
-    'columns_message',
-    'diagnostics_message',
-    'diagnostics_record',
-    'encoder_message',
-    'encoder_sample',
-    'field_message',
-    'field_sample',
-    'frame_of',
-    'header_message',
-    'imu_message',
-    'imu_sample',
-    'map_record',
-    'path_message',
-    'path_record',
-    'pose_message',
-    'poses_message',
-    'poses_record',
-    'ros_covariance',
-    'stamp_of',
-    'strain_is_stamped',
-    'strain_message',
-    'strain_sample',
-    'time_message',
-    'tip_message',
-    'tip_record',
-    'tof_frame',
-    'tof_message',
-    'tracked_pose',
-    'tracker_message',
-    'truth_sample',
-]
 
 # Aligned to 4 bytes, so that viewers which cast the buffer are served too.
 TOF_DTYPE = np.dtype(

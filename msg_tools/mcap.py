@@ -1,100 +1,22 @@
 """
-What is whole in an MCAP file that its recorder did not close (https://mcap.dev/spec).
+The frame of an MCAP file (https://mcap.dev/spec), for files that their recorder could not close.
 
-A file is a row of records: opcode (1 byte), length (8), content. Schemas, channels and messages
-stand between the magic bytes or, packed, in chunks. Killed recorders leave no index, and a last
-record that ends too soon.
+A file is a row of records: opcode (1 byte), length (8), content, behind magic bytes.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
-from io import BytesIO
 from itertools import takewhile
 import os
 from pathlib import Path
 from struct import unpack_from
-import sys
 from typing import BinaryIO
-from zlib import crc32
 
 MAGIC = b'\x89MCAP0\r\n'
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
+FOOTER, DATA_END = 2, 15
 # Data end, then a footer that names no summary: readers then look through the data.
 END = b'\x0f\x04' + bytes(7 + 4) + b'\x02\x14' + bytes(7 + 20) + MAGIC
-LARGEST_CHUNK = 2**28  # bytes unpacked: one that states more is damaged, or meant to fill memory
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic with its type, the type's definition (ROS's .msg text) and the stated metadata."""
-
-    topic: str
-    type: str  # noqa: A003  (ROS's word)
-    definition: str
-    metadata: bytes
-
-
-@dataclass
-class Survivors:
-    """
-    Iterates over the messages of a file up to where it is cut: (channel, log time ns, data).
-
-    Afterwards `left_over` is the number of bytes at the end that are no whole record, and
-    `damaged` the number of chunks that could not be unpacked.
-    """
-
-    path: Path
-    left_over: int = 0
-    damaged: int = 0
-    _schemas: dict[int, tuple[str, str]] = field(default_factory=dict)
-    _channels: dict[int, Channel] = field(default_factory=dict)
-
-    def __iter__(self) -> Iterator[tuple[Channel, int, bytes]]:
-        with self.path.open('rb') as stream:
-            end = stream.seek(0, os.SEEK_END)
-            for code, content, place, whole in records(stream):
-                self.left_over = end - place
-                yield from self._messages(code, content, whole)
-
-    def _messages(
-        self, code: int, content: bytes, whole: bool, span: tuple[int, int] = (0, 2**64)
-    ) -> Iterator:
-        try:
-            if code == CHUNK:
-                yield from self._unpacked(content, whole)
-            elif whole and code == SCHEMA:
-                name, _, text = _strings(content, 2, 3)
-                self._schemas[unpack_from('<H', content)[0]] = name.decode(), text.decode()
-            elif whole and code == CHANNEL:
-                number, schema = unpack_from('<HH', content)
-                topic, _, metadata = _strings(content, 4, 3)
-                kind, text = self._schemas[schema]
-                self._channels[number] = Channel(topic.decode(), kind, text, metadata)
-            elif whole and code == MESSAGE:
-                number, _, logged = unpack_from('<HIQ', content)
-                if not span[0] <= logged <= span[1]:
-                    raise ValueError('a message logged at another time than its chunk says')
-                yield self._channels[number], logged, content[22:]
-        except Exception:  # what unpackers and decoders say of damaged bytes has no common kind
-            self.damaged += 1
-
-    def _unpacked(self, content: bytes, whole: bool) -> Iterator:
-        """Messages of a chunk; of the last one, which may be cut, as many as there are."""
-        begin, end, size, crc = unpack_from('<QQQI', content)
-        (packing,) = _strings(content, 28, 1)
-        data = content[28 + 4 + len(packing) + 8 :]
-        if size > LARGEST_CHUNK:
-            raise ValueError(f'a chunk of {size} bytes')
-        data = _unpack(packing.decode(), data, size)
-        if whole and (len(data) != size or (crc and crc32(data) != crc)):
-            raise ValueError('a chunk that is not what its checksum says')
-        for code, inner, _, complete in records(BytesIO(data), begin=0):
-            if complete and code != CHUNK:  # none in another
-                yield from self._messages(code, inner, True, (begin, end))
 
 
 def records(stream: BinaryIO, begin: int = len(MAGIC)) -> Iterator[tuple[int, bytes, int, bool]]:
@@ -118,13 +40,12 @@ def records(stream: BinaryIO, begin: int = len(MAGIC)) -> Iterator[tuple[int, by
             return
 
 
-def close_cut(path: Path) -> tuple[Counter[str], int]:
+def close_cut(path: Path) -> None:
     """
     End a file after its last whole record, so that it can be read.
 
-    Returns the messages left, by topic, and the log time of the last one [ns]. Works on a full
-    disk: the end takes 50 bytes, for which records are given up where need be. Raises OSError
-    where that fails too.
+    Works on a full disk: the end takes 50 bytes, for which records are given up where need be.
+    Raises OSError where that fails too.
     """
     with path.open('rb') as stream:
         data = takewhile(lambda record: record[0] != DATA_END, records(stream))
@@ -134,44 +55,7 @@ def close_cut(path: Path) -> tuple[Counter[str], int]:
         try:
             with path.open('ab') as stream:
                 stream.write(END)
-            break
+            return
         except OSError:
             if not ends:
                 raise
-    counts: Counter[str] = Counter()
-    last = 0
-    for channel, logged, _ in Survivors(path):
-        counts[channel.topic] += 1
-        last = max(last, logged)
-    return counts, last
-
-
-def _strings(content: bytes, place: int, count: int) -> list[bytes]:
-    """Strings that follow one another from `place` on, each after its length of 4 bytes."""
-    found = []
-    for _ in range(count):
-        (length,) = unpack_from('<I', content, place)
-        found.append(content[place + 4 : place + 4 + length])
-        if len(found[-1]) < length:
-            raise EOFError
-        place += 4 + length
-    return found
-
-
-def _unpack(packing: str, data: bytes, size: int) -> bytes:
-    """At most `size` bytes of a packed chunk, and of one that is cut off what there is."""
-    if packing == 'zstd':
-        if sys.version_info >= (3, 14):
-            from compression import zstd
-        else:
-            from backports import zstd
-
-        with suppress(EOFError):
-            return zstd.ZstdDecompressor().decompress(data, size)
-    if packing == 'lz4':
-        from lz4.frame import LZ4FrameDecompressor
-
-        return LZ4FrameDecompressor().decompress(data, size)
-    if packing:
-        raise ValueError(f'packed by {packing}')
-    return data[:size]

@@ -22,7 +22,7 @@ from continuum_loc.measurements import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from msg_tools import convert
+from msg_tools import convert, geometry, results
 from msg_tools.factory import bag_messages, deserialize, ros_messages
 from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord
 from msg_tools.topics import INPUTS, tip_of, topic_of, topic_spec, TOPICS, TRACKER
@@ -206,7 +206,7 @@ def test_the_pose_covariance_is_turned_into_the_axes_of_the_map():
         samples[:, :3, :3] @ T[:3, :3].T
     ).as_rotvec()  # about the map's fixed axes
     empirical = np.cov(np.hstack([position, rotation]).T)
-    published = convert.ros_covariance(covariance, T[:3, :3]).reshape(6, 6)
+    published = geometry.ros_covariance(covariance, T[:3, :3]).reshape(6, 6)
     # The relative error of a sample covariance of n samples is about sqrt(2 / n) = 0.3 %; 5 sigma
     # of it.
     np.testing.assert_allclose(empirical, published, atol=0.016 * np.abs(published).max())
@@ -215,8 +215,8 @@ def test_the_pose_covariance_is_turned_into_the_axes_of_the_map():
 @flavours
 def test_the_tip_is_the_last_ring_with_twist_in_its_own_frame(make):
     estimate = _estimate()
-    message = convert.tip_message(make, tip_of(estimate), 'ring2')
-    back = convert.tip_record(message)
+    message = results.tip_message(make, tip_of(estimate), 'ring2')
+    back = results.tip_record(message)
     assert message.header.frame_id == 'map' and message.child_frame_id == 'ring2'
     np.testing.assert_allclose(back.T_map_tip, estimate.T_map_ring[-1], atol=1e-12)
     np.testing.assert_allclose(back.covariance, estimate.covariance[-1], atol=1e-12)
@@ -229,13 +229,13 @@ def test_clouds_and_diagnostics_survive(make):
     rng = np.random.default_rng(0)
     columns = ('x', 'y', 'z', 'sigma', 'anomaly')
     cloud = CloudRecord(5, {name: rng.normal(size=7).astype(np.float32) for name in columns})
-    back = convert.cloud_record(convert.columns_message(make, cloud))
+    back = results.cloud_record(results.columns_message(make, cloud))
     for name, values in cloud.fields.items():
         np.testing.assert_array_equal(back.fields[name], values)
     record = DiagnosticsRecord(
         9, (('estimator: engine', 2, 'lost', {'lag': '3'}), ('simulator', 0, 'running', {}))
     )
-    assert convert.diagnostics_record(convert.diagnostics_message(make, record)) == record
+    assert results.diagnostics_record(results.diagnostics_message(make, record)) == record
 
 
 @flavours
@@ -410,13 +410,13 @@ def test_joints_must_fit_their_names():
 
 
 def test_poses_must_be_poses_in_the_map():
-    message = convert.poses_message(bag_messages(), 1, np.eye(4)[None])
+    message = results.poses_message(bag_messages(), 1, np.eye(4)[None])
     message.poses[0].orientation.w = 0.5
     with pytest.raises(MessageError, match='norm 0.5'):
-        convert.poses_record(message)
+        results.poses_record(message)
     message.header.frame_id = 'odom'
     with pytest.raises(MessageError, match="valid: 'map'"):
-        convert.poses_record(message)
+        results.poses_record(message)
 
 
 def test_unknown_topics_are_named():

@@ -59,6 +59,40 @@ def test_raw_readings_become_measurements_and_bad_lines_are_named(tmp_path):
     assert REFUSED in node.log
 
 
+def test_lines_that_would_end_a_reader_are_refused_and_the_node_goes_on(tmp_path):
+    """Each of them ended the reader, or was published as something else, once."""
+    numbers = {'sensor': 'ring1_tof3', 'distance_mm': [int('9' * 400)] * 64}
+    lines = [
+        json.dumps(IMU | {'stamp': 1_700_000_000_123}),
+        json.dumps(TOF | {'target_status': [261] * 64}),
+        json.dumps(IMU | {'gyro_raw': [65530, 0, 0]}),
+        json.dumps(IMU | {'gyro_raw': [float('nan'), 0, 0]}),
+        json.dumps(numbers | {'target_status': [5] * 64}),
+        '[' * 3000 + ']' * 3000,
+        'x' * 200_000,
+        json.dumps(IMU),
+    ]
+    file = tmp_path / 'readings.jsonl'
+    file.write_text('\n'.join(lines))
+    node = Process('driver', fresh_domain(), tmp_path, source=file)
+    assert node.wait() == 0 and 'Traceback' not in node.log, node.log
+    assert '"published": {"imu/data_raw": 1}' in node.log
+    assert '"refused": {"stamp": 1, "value": 4, "line": 2}' in node.log
+    assert '(milliseconds?)' in node.log and 'nested too deeply' in node.log
+
+
+def test_a_port_that_is_pulled_out_ends_the_node_with_an_error(tmp_path):
+    """A node that lives on without its reader is deaf, and nobody knows."""
+    ours, theirs = os.openpty()
+    node = Process('driver', fresh_domain(), tmp_path, source=os.ttyname(theirs))
+    node.await_log('reading')
+    os.close(theirs)
+    os.close(ours)
+    assert wait_until(lambda: node.popen.poll() is not None), node.log
+    assert node.popen.returncode == 2 and 'Traceback' not in node.log
+    assert 'error: the source is a port that has gone' in node.log
+
+
 def test_a_file_is_read_to_its_end_and_a_missing_port_is_one_clear_line(tmp_path):
     file = tmp_path / 'readings.jsonl'
     file.write_text('\n'.join(map(json.dumps, (TOF, IMU, FIBRE))))

@@ -109,6 +109,47 @@ def test_an_overloaded_queue_gives_up_in_its_defined_order():
     assert oldest.topic == 'imu/data_raw'
 
 
+def test_the_queue_is_limited_in_bytes_as_well_as_in_messages():
+    """Ten messages of 30 kB are more than 100 kB: ToF frames go first, oldest first."""
+    inbox = Inbox(IntakeSettings(queue_bytes=100_000, max_backlog=1e9))
+    for number in range(5):
+        inbox.put('tof/points', number, 0, 30_000)
+        inbox.put('imu/data_raw', number, 0, 10_000)
+    left = list(iter(lambda: inbox.take(0.0), None))
+    assert [one.message for one in left if one.topic == 'imu/data_raw'] == list(range(5))
+    assert [one.message for one in left if one.topic == 'tof/points'] == [4]
+    assert inbox.dropped == {'tof/points': 4}
+    inbox.put('tof/points', 9, 0, 90_000)  # what was taken leaves room
+    assert inbox.take(0.0).message == 9 and inbox.dropped == {'tof/points': 4}
+
+
+def test_what_waits_for_a_simulated_clock_is_limited_in_bytes():
+    early, queue = Early(patience=60.0, most=100_000), Inbox(IntakeSettings())
+    for number in range(5):
+        queue.put('imu/data_raw', _imu(START + (60 + number) * SECOND), START, 30_000)
+    free = early.timely(list(iter(lambda: queue.take(0.0), None)), START, 0.5)
+    assert [one.stamp for one in free] == [START + 60 * SECOND, START + 61 * SECOND]
+    assert len(early) == 3
+
+
+def test_bytes_are_parsed_only_where_they_may_be_a_message():
+    def never(data, kind):
+        raise AssertionError('parsed')
+
+    told = []
+    intake = Intake(
+        load_robot('engine'),
+        IntakeSettings(largest_message=2000),
+        lambda kind, text: told.append(text),
+    )
+    data = bytes(typestore().serialize_cdr(_imu(START), 'sensor_msgs/msg/Imu'))
+    assert intake.parse('imu/data_raw', bytes(2001), never) is None
+    assert intake.parse('imu/data_raw', data[:-20], deserialize) is None
+    assert intake.parse('imu/data_raw', data, deserialize).header.frame_id == 'ring1_imu'
+    assert intake.refused == {'size': 1, 'bytes': 1}
+    assert told[0] == 'imu/data_raw: a message of 2001 bytes; valid: 2000'
+
+
 def test_old_tof_frames_are_dropped_and_counted_while_all_else_is_kept():
     inbox = Inbox(IntakeSettings(max_backlog=0.05))
     for number in range(10):

@@ -6,8 +6,8 @@ import signal
 
 from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds, TrackedPose
 from msg_tools.bag import BagWriter
-from msg_tools.convert import time_message
 from msg_tools.factory import ros_messages
+from msg_tools.geometry import time_message
 from node_graph import BoxRobot, Client, COMPILING, fresh_domain, Process, wait_until
 import numpy as np
 import pytest

@@ -20,7 +20,7 @@ from continuum_loc.errors import MessageError, SettingsError
 from continuum_loc.intake import Intake
 from continuum_loc.measurements import ImuSample, StrainSample, TofFrame
 from continuum_loc.nodes.support.readings import lines, Readings
-from continuum_loc.nodes.support.runtime import output_qos, PackageNode, run
+from continuum_loc.nodes.support.runtime import PackageNode, run
 from continuum_loc.nodes.support.settings import DriverNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
@@ -39,7 +39,7 @@ class DriverNode(PackageNode):
         self.published: Counter[str] = Counter()
         self.intake = Intake(robot, report=self._tell)
         self.readings = Readings(robot, self.settings, self.now)
-        self.outputs = {topic: self._publisher(topic) for topic in TOPIC_OF.values()}
+        self.outputs = {topic: self.publisher(topic) for topic in TOPIC_OF.values()}
         self._stop = threading.Event()
         self._source = _opened(self.settings.source)
         self._thread = self.thread(self._read, 'reader')
@@ -53,10 +53,6 @@ class DriverNode(PackageNode):
         os.close(self._source)
         counts = {'published': dict(self.published), 'refused': dict(self.intake.refused)}
         print(f'driver: {json.dumps(counts)}', file=sys.stderr)
-
-    def _publisher(self, topic: str) -> Any:
-        spec = topic_spec(topic)
-        return self.create_publisher(ros_messages().resolve(spec.type), topic, output_qos(spec))
 
     def _read(self) -> None:
         for line in lines(self._source, self._stop.is_set, self.settings.longest_line):

@@ -21,9 +21,10 @@ from continuum_loc.nodes.support.warm_up import warm_up
 from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from msg_tools.convert import columns_message, map_record, tip_message, tracked_pose
+from msg_tools.convert import tracked_pose
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
+from msg_tools.results import columns_message, map_record, tip_message
 from msg_tools.topics import tip_of, TRACKER
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -6,13 +6,14 @@ Node `recorder`: the topics of the contract into a bag.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from datetime import datetime
 from functools import partial
+from queue import Empty, Queue
 import sys
 import threading
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from continuum_loc.errors import SettingsError
 from continuum_loc.nodes.support.runtime import input_qos, PackageNode, run, write_summary
@@ -24,46 +25,8 @@ from rclpy.qos import DurabilityPolicy
 # [s] trackers are found on the graph, as only the robot description could name them before.
 WATCH_PERIOD = 0.5
 POLL = 0.1
+MOST_TOPICS = 256
 FLUSHED = 1.0  # s; what a recorder that is killed loses at most
-
-
-class Received(NamedTuple):
-    """A serialised message of a relative topic, and when it came [ns]."""
-
-    topic: str
-    data: bytes
-    stamp: int
-
-
-class Backlog:
-    """What waits to be written: at most `messages` and `size` bytes of it."""
-
-    def __init__(self, messages: int, size: int) -> None:
-        self._most, self._size = (messages, size), 0
-        self._waiting: deque[Received] = deque()
-        self._ready = threading.Condition()
-
-    def put(self, one: Received) -> bool:
-        """Take a message in; False where there is no room for it."""
-        messages, size = self._most
-        with self._ready:
-            if len(self._waiting) >= messages or self._size + len(one.data) > size:
-                return False
-            self._waiting.append(one)
-            self._size += len(one.data)
-            self._ready.notify()
-            return True
-
-    def take(self, timeout: float) -> Received | None:
-        """Return the oldest message, or None when none came within `timeout` seconds."""
-        with self._ready:
-            if not self._waiting:
-                self._ready.wait(timeout)
-            if not self._waiting:
-                return None
-            one = self._waiting.popleft()
-            self._size -= len(one.data)
-            return one
 
 
 class RecorderNode(PackageNode):
@@ -80,7 +43,8 @@ class RecorderNode(PackageNode):
         path = self.settings.bag or f'bag_{datetime.now():%Y%m%d_%H%M%S}'
         self.bag = BagWriter(path, self.get_namespace())
         self.dropped: Counter[str] = Counter()
-        self._backlog = Backlog(self.settings.queue_messages, self.settings.queue_bytes)
+        self._queue: Queue[tuple[str, bytes, int]] = Queue(self.settings.queue_messages)
+        self._bytes_in = self._bytes_out = 0  # each counted by one thread
         self._stop = threading.Event()
         self._thread = self.thread(self._write, 'writer')
         self._thread.start()
@@ -140,14 +104,17 @@ class RecorderNode(PackageNode):
                 or not split[1].startswith(TRACKER)
             ):
                 continue
-            if split[1] not in self._subscribed:
+            if split[1] not in self._subscribed and len(self._subscribed) < MOST_TOPICS:
                 self._subscribe(split[1])
 
     def _receive(self, topic: str, data: bytes) -> None:
         if len(data) > self.settings.largest_message:
             self._drop(topic, f'messages of more than {self.settings.largest_message} bytes')
-        elif not self._backlog.put(Received(topic, data, self.now())):
+        elif self._bytes_in - self._bytes_out > self.settings.queue_bytes or self._queue.full():
             self._drop(topic, 'what comes faster than it can be written')
+        else:
+            self._bytes_in += len(data)
+            self._queue.put((topic, data, self.now()))
 
     def _drop(self, topic: str, what: str) -> None:
         self.dropped[topic] += 1
@@ -157,11 +124,14 @@ class RecorderNode(PackageNode):
     def _write(self) -> None:
         flushed = time.monotonic()
         while True:
-            one = self._backlog.take(POLL)
-            if one is not None:
-                self.bag.write_raw(one.topic, one.data, one.stamp)
-            elif self._stop.is_set():
-                return
+            try:
+                topic, data, stamp = self._queue.get(timeout=POLL)
+            except Empty:
+                if self._stop.is_set():
+                    return
+            else:
+                self.bag.write_raw(topic, data, stamp)
+                self._bytes_out += len(data)
             if time.monotonic() - flushed > FLUSHED:
                 self.bag.flush()
                 flushed = time.monotonic()

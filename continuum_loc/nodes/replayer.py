@@ -17,12 +17,12 @@ from continuum_loc.errors import BagError, SettingsError
 from continuum_loc.measurements import nanoseconds
 from continuum_loc.nodes.support.delivery import await_acknowledged, await_listeners
 from continuum_loc.nodes.support.pacing import Paced
-from continuum_loc.nodes.support.runtime import output_qos, PackageNode, run
+from continuum_loc.nodes.support.runtime import PackageNode, run
 from continuum_loc.nodes.support.settings import ReplayerNodeSettings
 from msg_tools.bag import contract_topics, open_bag, raw_messages
-from msg_tools.convert import time_message
 from msg_tools.factory import ros_messages
-from msg_tools.topics import INPUTS, topic_spec, TOPICS, TRACKER
+from msg_tools.geometry import time_message
+from msg_tools.topics import INPUTS, TOPICS, TRACKER
 from rosgraph_msgs.msg import Clock
 
 LOOKAHEAD = 0.5  # s
@@ -38,7 +38,7 @@ class ReplayerNode(PackageNode):
         self.check_parameters()
         self.path = Path(self.settings.bag)
         self.published: Counter[str] = Counter()
-        self.outputs = {topic: self._publisher(topic) for topic in self._topics()}
+        self.outputs = {topic: self.publisher(topic) for topic in self._topics()}
         self._clock_output = (
             self.create_publisher(Clock, CLOCK, 10) if self.settings.clock else None
         )
@@ -79,10 +79,6 @@ class ReplayerNode(PackageNode):
                 f'it holds {", ".join(sorted(present))}'
             )
         return sorted(topics)
-
-    def _publisher(self, topic: str) -> Any:
-        spec = topic_spec(topic)
-        return self.create_publisher(ros_messages().resolve(spec.type), topic, output_qos(spec))
 
     def _play(self) -> None:
         going = self._wait_for_listeners()

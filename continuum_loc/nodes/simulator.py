@@ -15,7 +15,7 @@ from typing import Any
 
 from continuum_loc.nodes.support.delivery import await_acknowledged, await_listeners
 from continuum_loc.nodes.support.pacing import Paced
-from continuum_loc.nodes.support.runtime import Delays, output_qos, PackageNode, run, write_summary
+from continuum_loc.nodes.support.runtime import Delays, PackageNode, run, write_summary
 from continuum_loc.nodes.support.settings import SimulatorNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
@@ -33,8 +33,8 @@ class SimulatorNode(PackageNode):
         self.world = self._world()
         self.published: Counter[str] = Counter()
         self.delays = Delays()
-        self.outputs = {topic: self._publisher(topic) for topic in self._topics()}
-        self._diagnostics = self._publisher('/diagnostics')
+        self.outputs = {topic: self.publisher(topic) for topic in self._topics()}
+        self._diagnostics = self.publisher('/diagnostics')
         self._state = 'preparing'
         self._failure: BaseException | None = None
         self._paced = Paced(self._stamped(), self.settings.lookahead)
@@ -87,10 +87,6 @@ class SimulatorNode(PackageNode):
         return [topic for topic, present in kinds.items() if present] + [
             TRACKER + t.name for t in self.robot.trackers
         ]
-
-    def _publisher(self, topic: str) -> Any:
-        spec = topic_spec(topic)
-        return self.create_publisher(ros_messages().resolve(spec.type), topic, output_qos(spec))
 
     # ------------------------------------------------ simulation (its own threads)
 

@@ -26,6 +26,7 @@ KINDS = {  # topic -> what a filter counts it as
     'joint_states': 'EncoderSample',
 }
 TRUTH = 'ground_truth/poses'
+BAG = 'bag'  # for what is wrong with all of it
 LONGEST_STEP = NANOSECONDS  # between two estimates over which a suspect is one
 HONEST, SURE = (0.5, 1.5), 3.0  # of a figure that is 1 where the covariance is honest
 SHOWN = 5  # reasons or suspects on the terminal; all are in the summary
@@ -68,6 +69,7 @@ def account_of(
     problems = [_unused(name, rows[name], counts) for name in unused]
     if truth['received'] and not truth['used']:
         problems.append(f'no truth could be used: {truth["first"]}')
+    problems += [one['first'] for one in intake['refusals'].get(BAG, {}).values()]
     if not summary['estimates']['all']:
         came = ', '.join(f'{row["received"]} {name}' for name, row in rows.items())
         problems.insert(0, f'no estimate: {came or "no measurement in it"}')

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from continuum_loc.errors import BagError
+from continuum_loc.offline.mcap_survivors import Channel, Survivors
 from msg_tools.bag import open_bag, storage_files
 from msg_tools.factory import typestore
-from msg_tools.mcap import Channel, Survivors
 
 
 @dataclass

@@ -31,7 +31,7 @@ from continuum_loc.measurements import (
     TrackedPose,
     TruthSample,
 )
-from continuum_loc.offline.account import Suspicion, TRUTH
+from continuum_loc.offline.account import BAG, Suspicion, TRUTH
 from continuum_loc.robot import RobotDescription
 from continuum_loc.trajectory import known_at, Trajectory
 from msg_tools.factory import deserialize
@@ -171,16 +171,20 @@ def _recorded(
             intake.refuse('type', text, topic, count)
 
     first = None
-    for topic, logged, data in raw_messages(bag, (*inputs, TRUTH), namespace, mistyped):
-        first = logged if first is None else first
-        progress(seconds(logged, first))
-        try:
+    try:
+        for topic, logged, data in raw_messages(bag, (*inputs, TRUTH), namespace, mistyped):
+            first = logged if first is None else first
+            progress(seconds(logged, first))
             message = intake.parse(topic, data, deserialize)
             sample = None if message is None else intake.accept(topic, message, logged)
-        except MessageError as error:  # a strict gate's
-            raise BagError(f'{bag}: {error} (logged at {logged / NANOSECONDS:.6f} s)') from None
-        if sample is not None:
-            yield topic, sample
+            if sample is not None:
+                yield topic, sample
+    except MessageError as error:  # a strict gate's
+        raise BagError(f'{bag}: {error} (logged at {logged / NANOSECONDS:.6f} s)') from None
+    except BagError as error:
+        if first is None:
+            raise
+        intake.refuse('damaged', str(error), BAG)  # from here on: what came before is used
 
 
 def one_thread() -> threadpool_limits:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 import json
 import os
 import select
+import stat
 from typing import Any
 
 from continuum_loc.errors import MessageError, RunFailure
@@ -29,6 +30,7 @@ FORMS = {  # by the field that tells them apart: all fields, those in brackets m
 UNITS = ((1e17, ' (nanoseconds?)'), (1e14, ' (microseconds?)'), (1e11, ' (milliseconds?)'))
 CHUNK = 65536  # bytes
 POLL = 0.1  # s; how often a reader without input looks whether it has to stop
+MEMORY = 1  # major number of devices as /dev/null
 SHOWN = 60  # bytes of a line in what is said of it
 MOST_SAID = 400  # characters
 
@@ -167,6 +169,15 @@ def lines(source: int, stopped: Callable[[], bool], longest: int) -> Iterator[by
             skipping = True
         rest = b'' if skipping else rest
         if not chunk:
+            if _hung_up(source):
+                raise RunFailure('the source is a port that has gone')
             break
     if rest.strip():
         yield rest
+
+
+def _hung_up(source: int) -> bool:
+    """Whether an end is that of a port which was pulled out; one that was typed is an end."""
+    state = os.fstat(source)
+    device = stat.S_ISCHR(state.st_mode) and os.major(state.st_rdev) != MEMORY
+    return device and not os.isatty(source)

@@ -27,7 +27,7 @@ from continuum_loc.nodes.support.parameters import (
 )
 from continuum_loc.settings import Settings
 from msg_tools.factory import ros_messages
-from msg_tools.topics import Topic
+from msg_tools.topics import Topic, topic_spec
 import numpy as np
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError  # rclpy gives it no public name
@@ -113,6 +113,11 @@ class PackageNode(Node):
         subscription = self.create_subscription(
             ros_messages().resolve(type_name), topic, take, qos, raw=raw
         )
+
+    def publisher(self, topic: str) -> Any:
+        """Make a publisher of a topic of the contract."""
+        spec = topic_spec(topic)
+        return self.create_publisher(ros_messages().resolve(spec.type), topic, output_qos(spec))
 
     def every(self, period: float, action: Callable[[], None]) -> None:
         """Do `action` each `period` seconds of real time: a simulated clock may stand still."""

@@ -12,8 +12,8 @@ from typing import Any
 
 from continuum_loc import lie
 from continuum_loc.robot import RobotDescription
-from msg_tools.convert import header_message, MAP, pose_message
 from msg_tools.factory import Messages, ros_messages
+from msg_tools.geometry import header_message, MAP, pose_message
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

@@ -23,7 +23,6 @@ from continuum_loc.nodes.support.runtime import (
     Delays,
     deserialized,
     input_qos,
-    output_qos,
     PackageNode,
     write_summary,
 )
@@ -164,10 +163,7 @@ class WorkerNode(PackageNode):
     def publisher(self, topic: str) -> Any:
         """Return the publisher of a topic of the contract."""
         if topic not in self.outputs:
-            spec = topic_spec(topic)
-            self.outputs[topic] = self.create_publisher(
-                ros_messages().resolve(spec.type), topic, output_qos(spec)
-            )
+            self.outputs[topic] = super().publisher(topic)
         return self.outputs[topic]
 
     # ------------------------------------------------ reception (executor thread)
