@@ -164,6 +164,18 @@ def check_parameter_file(path: str | Path) -> None:
         raise _refusal(path, error) from None
 
 
+def check_yaml(path: Path) -> None:
+    """
+    Refuse a YAML file that is none, is nested too deep or unfolds to too much.
+
+    For files that others read, who may not look. Raises SettingsError.
+    """
+    try:
+        _composed(read_text(path))
+    except yaml.YAMLError as error:
+        raise _refusal(path, error) from None
+
+
 def is_octal(text: str) -> bool:
     """Tell whether ROS takes a plain text for an octal number."""
     return re.fullmatch(r'[-+]?0[0-7]+', text) is not None
