@@ -276,73 +276,76 @@ def _odd_samples() -> Iterator[Case]:
 # Lines of a driver
 
 
+NAN = float('nan')
+FRAME = {
+    'sensor': 'ring1_tof1',
+    'distance_mm': [500] * 64,
+    'target_status': [5] * 64,
+    'stamp': 1.0,
+}
+TURN = {'sensor': 'ring1_imu', 'gyro_raw': [100, -200, 300], 'accel_raw': [0, 0, 8190]}
+FIBRE = {'s': [0.1], 'strains': [[0.0, 0.0, 0.0]], 'stamp': 2.0}
+BAD_FRAMES = {
+    'status 261': {'target_status': [261] * 64},
+    'status -1': {'target_status': [-1] * 64},
+    'status 5.5': {'target_status': [5.5] * 64},
+    'half a status': {'target_status': [5] * 63},
+    '16 zones': {'distance_mm': [500] * 16, 'target_status': [5] * 16},
+    'distance of nan': {'distance_mm': [NAN] * 64},
+    'distance of infinity': {'distance_mm': [float('inf')] * 64},
+    'distance of 70000 mm': {'distance_mm': [70_000] * 64},
+    'distance of 400 digits': {'distance_mm': [10**400] * 64},
+    'distance as a text': {'distance_mm': ['500'] * 64},
+    'distance as truth': {'distance_mm': [True] * 64},
+    'sigma of nan': {'range_sigma_mm': [NAN] * 64},
+    'stamp in milliseconds': {'stamp': 1_700_000_000_123},
+    'stamp in nanoseconds': {'stamp': 1_700_000_000_000_000_000},
+    'negative stamp': {'stamp': -1.0},
+    'stamp of nan': {'stamp': NAN},
+    'stamp as a text': {'stamp': 'now'},
+    'an unknown field': {'colour': 'red'},
+    'a sensor that is a number': {'sensor': 7},
+}
+BAD_TURNS = {
+    'gyro beyond 16 bits': {'gyro_raw': [65_530, 0, 0]},
+    'gyro of nan': {'gyro_raw': [NAN, 0, 0]},
+    'gyro of two axes': {'gyro_raw': [1, 2]},
+    'gyro of a fraction': {'gyro_raw': [0.5, 0, 0]},
+    'accelerometer beyond 16 bits': {'accel_raw': [0, 0, -40_000]},
+    'no accelerometer': {'accel_raw': None},
+}
+BAD_FIBRES = {
+    'strain of nan': {'strains': [[NAN, 0, 0]]},
+    'strain of two cores': {'strains': [[0, 0]]},
+    'strain of 200 %': {'strains': [[2.0, 0, 0]]},
+    'more strains than stations': {'strains': [[0, 0, 0], [0, 0, 0]]},
+}
+BAD_LINES = {
+    'no JSON': b'{"sensor": ',
+    'a list': b'[1, 2]',
+    'a number': b'7',
+    'nothing known': b'{"temperature": 20}',
+    'brackets 3,000 deep': b'[' * 3000 + b']' * 3000,
+    'brackets 1,000,000 deep': b'[' * 1_000_000,
+    'not UTF-8': b'\xff\xfe{}',
+    'a field twice': json.dumps(TURN).encode().replace(b'{', b'{"sensor": "a", '),
+    'a megabyte of one number': b'{"gyro_raw": ' + b'9' * 1_000_000 + b'}',
+}
+
+
 def _lines() -> Iterator[Case]:
     """Lines as a microcontroller writes them; each is to give its values, or a MessageError."""
-    tof = {
-        'sensor': 'ring1_tof1',
-        'distance_mm': [500] * 64,
-        'target_status': [5] * 64,
-        'stamp': 1.0,
-    }
-    imu = {'sensor': 'ring1_imu', 'gyro_raw': [100, -200, 300], 'accel_raw': [0, 0, 8190]}
-    yield _line('a frame', tof, READ, _sees(0.5))
-    yield _line(
-        'a frame without a target', tof | {'target_status': [255] * 64}, READ, _sees(np.inf)
-    )
-    yield _line('a turn', imu, READ, _turns(100 * 0.0175))
-    strains = {'s': [0.1], 'strains': [[0.0, 0.0, 0.0]], 'stamp': 2.0}
-    yield _line('a straight fibre', strains, READ)
-    for name, change in {
-        'status 261': {'target_status': [261] * 64},
-        'status -1': {'target_status': [-1] * 64},
-        'status 5.5': {'target_status': [5.5] * 64},
-        'half a status': {'target_status': [5] * 63},
-        '16 zones': {'distance_mm': [500] * 16, 'target_status': [5] * 16},
-        'distance of nan': {'distance_mm': [float('nan')] * 64},
-        'distance of infinity': {'distance_mm': [float('inf')] * 64},
-        'distance of 70000 mm': {'distance_mm': [70_000] * 64},
-        'distance of 400 digits': {'distance_mm': [10**400] * 64},
-        'distance as a text': {'distance_mm': ['500'] * 64},
-        'distance as truth': {'distance_mm': [True] * 64},
-        'a list in a list': {'distance_mm': [[500]] * 64},
-        'sigma of nan': {'range_sigma_mm': [float('nan')] * 64},
-        'stamp in milliseconds': {'stamp': 1_700_000_000_123},
-        'stamp in nanoseconds': {'stamp': 1_700_000_000_000_000_000},
-        'negative stamp': {'stamp': -1.0},
-        'stamp of nan': {'stamp': float('nan')},
-        'stamp as a text': {'stamp': 'now'},
-        'an unknown field': {'colour': 'red'},
-        'a sensor that is a number': {'sensor': 7},
-    }.items():
-        yield _line(name, tof | change, REFUSED)
-    for name, change in {
-        'gyro beyond 16 bits': {'gyro_raw': [65_530, 0, 0]},
-        'gyro of nan': {'gyro_raw': [float('nan'), 0, 0]},
-        'gyro of two axes': {'gyro_raw': [1, 2]},
-        'gyro of a fraction': {'gyro_raw': [0.5, 0, 0]},
-        'accelerometer beyond 16 bits': {'accel_raw': [0, 0, -40_000]},
-        'no accelerometer': {'accel_raw': None},
-    }.items():
-        yield _line(name, imu | change, REFUSED)
-    for name, change in {
-        'strain of nan': {'strains': [[float('nan'), 0, 0]]},
-        'strain of two cores': {'strains': [[0, 0]]},
-        'strain of 200 %': {'strains': [[2.0, 0, 0]]},
-        'more strains than stations': {'strains': [[0, 0, 0], [0, 0, 0]]},
-    }.items():
-        yield _line(name, strains | change, REFUSED)
-    for name, text in {
-        'no JSON': b'{"sensor": ',
-        'a list': b'[1, 2]',
-        'a number': b'7',
-        'nothing known': b'{"temperature": 20}',
-        'brackets 3,000 deep': b'[' * 3000 + b']' * 3000,
-        'brackets 1,000,000 deep': b'[' * 1_000_000,
-        'not UTF-8': b'\xff\xfe{}',
-        'a field twice': b'{"sensor": "a", "sensor": "b", "gyro_raw": [0, 0, 0], "accel_raw": '
-        b'[0, 0, 0]}',
-        'a megabyte of one number': b'{"gyro_raw": ' + b'9' * 1_000_000 + b'}',
-    }.items():
+    yield _line('a frame', FRAME, READ, _sees(0.5))
+    empty = FRAME | {'target_status': [255] * 64}
+    yield _line('a frame without a target', empty, READ, _sees(np.inf))
+    nested = FRAME | {'distance_mm': [[500]] * 64}
+    yield _line('a list of lists', nested, EITHER, _sees(0.5))
+    yield _line('a turn', TURN, READ, _turns(100 * 0.0175))
+    yield _line('a straight fibre', FIBRE, READ)
+    for good, changes in ((FRAME, BAD_FRAMES), (TURN, BAD_TURNS), (FIBRE, BAD_FIBRES)):
+        for name, change in changes.items():
+            yield _line(name, good | change, REFUSED)
+    for name, text in BAD_LINES.items():
         yield Case('line', name, lambda folder, text=text: text, sample_of, REFUSED)
 
 

@@ -16,17 +16,21 @@ import subprocess
 import sys
 
 from studies._input_case import attempt, Case, CRASH, HANG, Result
+from studies._input_clouds import cloud_cases
+from studies._input_maps import map_cases
+from studies._input_meshes import mesh_cases
 from studies._input_settings import settings_cases
-from studies._input_shapes import shape_cases
+from studies._input_tables import table_cases
 from studies._input_wires import wire_cases
 
+KINDS = (cloud_cases, table_cases, mesh_cases, map_cases, settings_cases, wire_cases)
 LIMIT = 10.0  # s: a longer answer is none
 START_LIMIT = 120.0  # s: for imports, and for what is compiled once
 
 
 def all_cases(seed: int) -> list[Case]:
     """Make the corpus, the same for the same seed in every process."""
-    return [*shape_cases(seed), *settings_cases(seed), *wire_cases(seed)]
+    return [case for cases in KINDS for case in cases(seed)]
 
 
 class Worker:
