@@ -44,6 +44,7 @@ setup(
         'numpy>=1.26',
         'scipy>=1.11',
         'numba>=0.58',
+        'llvmlite',  # which numba brings; its version is part of what a kernel was made of
         'threadpoolctl',
         'pydantic>=2.4',
         'pyyaml',

@@ -726,6 +726,7 @@ def _describe_map(path: Path, prior: Any) -> None:
         f'mean planarity {prior.planarity.mean():.2f}, '
         f'normals {"outward" if prior.oriented else "of either sign"}',
         highlight=False,
+        soft_wrap=True,
     )
     _say(path, (*prior.notes, *size_note(prior)))
 

@@ -7,6 +7,7 @@ and an archive of a kilobyte can unfold to a gigabyte. Nothing that could run co
 
 from __future__ import annotations
 
+from collections import Counter
 import math
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,7 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
 
 def _check_sizes(members: list[zipfile.ZipInfo], size: int) -> None:
     names = [member.filename for member in members]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise NotAnArchive(f'{twice[0]} is in it twice')
     unfolded = sum(member.file_size for member in members)

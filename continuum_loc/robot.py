@@ -10,6 +10,7 @@ arclength; a sensor's pose on its ring is `T_ring_sensor`. A ToF sensor's optica
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -303,12 +304,13 @@ class RobotDescription(Settings):
                 f"ring '{self.rings[-1].name}' at s = {arclengths[-1]} lies beyond the length "
                 f'{self.length}'
             )
-        names = [sensor.name for sensor in self.sensors] + [ring.name for ring in self.rings]
-        doubled = sorted({name for name in names if names.count(name) > 1})
+        names = Counter(one.name for one in (*self.sensors, *self.rings))
+        doubled = sorted(name for name, count in names.items() if count > 1)
         if doubled:
             raise ValueError(f'names must be unique, used more than once: {", ".join(doubled)}')
+        rings = set(self.ring_names)
         for sensor in self.sensors:
-            if sensor.ring not in self.ring_names:
+            if sensor.ring not in rings:
                 raise ValueError(
                     f"sensor '{sensor.name}' is on unknown ring '{sensor.ring}'; "
                     f'rings: {", ".join(self.ring_names)}'

@@ -26,6 +26,8 @@ from pydantic import (
     ValidationInfo,
 )
 
+LONGEST_ERROR = 500  # characters of each
+MOST_ERRORS = 10  # that are told of a file at once
 LONGEST_NAME = 100  # characters; a name becomes part of a file's, which may have 255
 
 
@@ -126,10 +128,13 @@ def parse_settings(
     try:
         return model.model_validate(data)
     except ValidationError as error:
+        found = _causes(error.errors())
         lines = [
-            f'{where}: {_explain(model, item)}{_in_line(line_of(item["loc"]))}'
-            for item in _causes(error.errors())
+            f'{where}: {_explain(model, item)[:LONGEST_ERROR]}{_in_line(line_of(item["loc"]))}'
+            for item in found[:MOST_ERRORS]
         ]
+        if len(found) > MOST_ERRORS:
+            lines.append(f'{where}: and {len(found) - MOST_ERRORS} more')
         raise SettingsError('\n'.join(lines)) from None
 
 

@@ -16,9 +16,9 @@ from typing import Any
 from continuum_loc.errors import SettingsError
 import yaml
 
-LARGEST_FILE = 4_000_000  # bytes; 30,000 key frames of a trajectory are two
+LARGEST_FILE = 4_000_000  # bytes; a trajectory of 10,000 key frames has one
 DEEPEST = 50  # collections inside of each other; our own files have six
-MOST_VALUES = 500_000  # after every anchor was put where it is named
+MOST_VALUES = 100_000  # also after every anchor was put where it is named
 LONGEST_NUMBER = 40  # characters; a double has 17 digits
 
 _TAG = 'tag:yaml.org,2002:'
@@ -164,6 +164,18 @@ def check_parameter_file(path: str | Path) -> None:
         raise _refusal(path, error) from None
 
 
+def check_yaml(path: Path) -> None:
+    """
+    Refuse a YAML file that is none, is nested too deep or unfolds to too much.
+
+    For files that others read, who may not look. Raises SettingsError.
+    """
+    try:
+        _composed(read_text(path))
+    except yaml.YAMLError as error:
+        raise _refusal(path, error) from None
+
+
 def is_octal(text: str) -> bool:
     """Tell whether ROS takes a plain text for an octal number."""
     return re.fullmatch(r'[-+]?0[0-7]+', text) is not None
@@ -171,8 +183,11 @@ def is_octal(text: str) -> bool:
 
 def _composed(text: str) -> yaml.Node | None:
     """Compose the tree of nodes, after a look at its depth, and check keys, tags and size."""
-    depth = 0
+    depth, values = 0, 0
     for event in yaml.parse(text, Loader=_Loader):
+        values += 1
+        if values > 2 * MOST_VALUES:
+            raise _problem(event, f'more than {MOST_VALUES} values')
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEEPEST:

@@ -19,6 +19,7 @@ from typing import Any
 
 from continuum_loc.errors import BagError, MessageError
 from continuum_loc.measurements import NANOSECONDS
+from continuum_loc.yaml_files import check_yaml
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.mcap import close_cut
 from msg_tools.topics import cloud_topic_record, INPUTS, Topic, topic_spec, TOPICS, TRACKER
@@ -239,6 +240,8 @@ def open_bag(path: Path) -> Iterator[Any]:
             'or an .mcap or .db3 file'
         )
     try:
+        if (metadata := path / 'metadata.yaml').is_file():
+            check_yaml(metadata)
         reader = Reader(_storage_of(path))
         reader.open()
     except (

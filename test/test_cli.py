@@ -7,6 +7,7 @@ import sys
 from continuum_loc.errors import StudyError
 from continuum_loc.offline.as_json import plain
 from continuum_loc.offline.claims import at_least, at_most, between, Claim, write_study
+import numpy as np
 import pytest
 from studies import load_study
 
@@ -99,6 +100,33 @@ def test_map_build_convert_and_info(tmp_path):
     built, converted = load_map(tmp_path / 'box.npz'), load_map(tmp_path / 'box.ply')
     assert len(built) == len(converted)
     assert f'{len(built):,} points' in said.stdout
+
+
+def test_a_scan_in_millimetres_is_told_refused_and_converted(tmp_path):
+    from continuum_loc.mapping.map_files import load_map
+
+    rng = np.random.default_rng(0)
+    rows = [f'{x:.1f} {y:.1f} 0.0 9 9 9' for x, y in rng.uniform(-1000, 1000, (500, 2))]
+    (tmp_path / 'scan.xyz').write_text('\n'.join([*rows, '']))
+    said = run('map', 'info', 'scan.xyz', cwd=tmp_path)
+    assert said.returncode == 0 and '500 points' in said.stdout
+    assert 'left aside: red, green, blue' in said.stderr
+    assert 'looks like millimetres' in said.stderr
+    refused = run('replay', 'no_bag', '--map', 'scan.xyz', cwd=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith('error: scan.xyz: ') and '--scale 0.001' in refused.stderr
+    options = ('--scale', '0.001', '--sigma', '0.002', '--viewpoint', '0', '0', '1')
+    assert run('map', 'convert', 'scan.xyz', 'map.npz', *options, cwd=tmp_path).returncode == 0
+    prior = load_map(tmp_path / 'map.npz')
+    assert np.abs(prior.points).max() == pytest.approx(1.0, abs=0.01)
+    assert prior.sigma == 0.002 and prior.oriented
+    said = run('map', 'info', 'map.npz', cwd=tmp_path)
+    assert 'sigma 2 mm' in said.stdout and 'millimetres' not in said.stderr
+
+
+def test_names_with_markup_are_printed_as_they_are(tmp_path):
+    (tmp_path / '[red]scan.xyz').write_text('0 0 0\n1 0 0\n0 1 0\n')
+    assert '[red]scan.xyz: 3 points' in run('map', 'info', '[red]scan.xyz', cwd=tmp_path).stdout
 
 
 def test_claims_hold_only_inside_their_bounds():

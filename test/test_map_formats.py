@@ -603,3 +603,48 @@ def test_any_changed_bytes_are_points_or_an_error(cloud, data):
         assert np.isfinite(shape(suffix, bytes(damaged)).points).all()
     except MapError as error:
         assert str(error).startswith(f'part{suffix}')
+
+
+# Nothing takes its time from what a header says
+
+
+def test_a_field_of_a_million_million_values_is_refused():
+    for encoding in ENCODINGS:
+        data = dialects.pcd({**xyz(POINTS), 'h': ('f4', np.ones(60))}, encoding)
+        lying = data.replace(b'COUNT 1 1 1 1', b'COUNT 1 1 1 1000000000000')
+        refused('.pcd', lying, 'ends after 0 of 60 points|60 points, which are')
+
+
+def test_a_row_of_a_million_columns_is_refused():
+    refused('.xyz', '1 ' * 1_000_000 + '\n', 'line 1: 1000000 columns; at most 1000 are read')
+    refused(
+        '.csv', ','.join(f'c{k}' for k in range(10_000)) + '\n1,2,3\n', 'line 1: columns c0,c1'
+    )
+
+
+def test_a_file_larger_than_the_memory_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / 'sparse.ply'
+    with path.open('wb') as stream:
+        stream.truncate(10**14)  # a sparse file: no such space is taken
+    with pytest.raises(MapError, match=r'sparse\.ply: does not fit into memory'):
+        load_map(path)
+
+
+def test_of_very_many_wrong_lines_the_first_is_told_and_not_all_are_counted():
+    refused('.xyz', '1 2 3\n' * 20_000 + '1 x 3\n' * 20_000, 'line 20001, .*more than 1000 such')
+
+
+@pytest.mark.parametrize('suffix', ['.ply', '.pcd', '.stl', '.obj'])
+def test_a_byte_order_mark_before_a_text_format_is_no_part_of_it(suffix):
+    vertices, sides = dialects.box([0, 0, 0], [1, 1, 1])
+    text = {
+        '.ply': dialects.ply(xyz(vertices)),
+        '.pcd': dialects.pcd(xyz(vertices), 'ascii'),
+        '.stl': dialects.ascii_stl(vertices[np.array(dialects.triangles(sides))]).encode(),
+        '.obj': dialects.obj(vertices, sides).encode(),
+    }[suffix]
+    plain, marked = shape(suffix, text), shape(suffix, b'\xef\xbb\xbf' + text)
+    assert marked.notes == plain.notes
+    for name in ('points', 'vertices', 'faces'):
+        if hasattr(plain, name):
+            np.testing.assert_array_equal(getattr(marked, name), getattr(plain, name))

@@ -182,9 +182,30 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
 def test_a_damaged_result_is_named(result, tmp_path):
     folder = new_run('replay', tmp_path)
     save_run(folder, result, kind='replay', seed=0, configuration={})
-    (folder / 'result.npz').write_bytes(b'not a result')
-    with pytest.raises(RunError, match=r'result\.npz: damaged'):
-        load_run(folder)
+    whole = (folder / 'result.npz').read_bytes()
+    for damaged in (b'not a result', b'', whole[:-1], whole[:-200], whole[: len(whole) // 2]):
+        (folder / 'result.npz').write_bytes(damaged)
+        with pytest.raises(RunError, match=r'result\.npz: damaged'):
+            load_run(folder)
+
+
+@pytest.mark.parametrize(
+    ('name', 'content'),
+    [
+        ('summary.json', b'{"kind": '),
+        ('summary.json', b'[1]'),
+        ('summary.json', b'\xff'),
+        ('summary.json', b'[' * 100_000),
+        ('configuration.yaml', b'a: 1\na: 2\n'),
+        ('configuration.yaml', b'- 1\n'),
+        ('configuration.yaml', b'[' * 5000),
+    ],
+)
+def test_damaged_files_of_a_run_are_named(result, tmp_path, name, content):
+    save_run(tmp_path, result, kind='replay', seed=0, configuration={})
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RunError, match=rf'{name}: damaged'):
+        load_run(tmp_path)
 
 
 def test_without_truth_or_estimates_figures_are_unknown_and_not_zero():

@@ -167,7 +167,7 @@ def test_anchors_are_kept_and_those_that_unfold_without_end_are_refused(written)
     lines += [
         f'{n}: &{n} [{", ".join([f"*{p}"] * 9)}]' for p, n in zip(names, names[1:], strict=False)
     ]
-    refused(load_robot, written('\n'.join(lines)), 'more than 500000 values')
+    refused(load_robot, written('\n'.join(lines)), 'more than 100000 values')
     refused(load_robot, written('a: &a [*a]\n'), 'line 1: an anchor that holds itself')
 
 

@@ -149,7 +149,7 @@ def _write_text(prior: PriorMap, path: Path) -> None:
     np.savetxt(
         path,
         prior.table,
-        fmt='%.9g',
+        fmt='%.12g',
         delimiter=',' if comma else ' ',
         header=','.join(CLOUD_COLUMNS) if comma else '',
         comments='',

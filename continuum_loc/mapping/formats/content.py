@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import zlib
 
 from continuum_loc.errors import MapError
 
+MOST_MEMORY = 0.5  # share of the machine's that a file may have; reading it takes as much again
 SMALL = 64_000_000  # bytes that any packed file may unfold to
 MOST_UNFOLDED = 100  # times the packed size, beyond that; tables of numbers reach ten
 _CHUNK = 1 << 20
@@ -20,6 +22,9 @@ def bytes_of(path: Path) -> bytes:
     """
     if not path.is_file():
         raise MapError(f'{path}: {_what_it_is(path)}')
+    memory = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE')
+    if path.stat().st_size > MOST_MEMORY * memory:
+        raise MapError(f'{path}: does not fit into memory')
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -8,6 +8,8 @@ import re
 from continuum_loc.errors import MapError
 import numpy as np
 
+CHUNK = 10_000  # rows that are searched together for one that is wrong
+MOST_COUNTED = 1000  # wrong rows
 _DECIMAL_COMMA = re.compile(r'[-+]?\d*,\d+(?:[eE][-+]?\d+)?')
 _FRACTION = re.compile(r'[-+]?\d*\.(\d+)(?:[eE][-+]?(\d+))?')
 _WORD_CHARACTER = re.compile(r'[\w.+-]$')
@@ -42,13 +44,18 @@ def table_of(
     """
     if not rows:
         return np.empty((0, len(names)))
+    table = _parsed(rows, names, delimiter)
+    if table is None:
+        raise MapError(f'{where}, {_complaint(rows, numbers, names, delimiter)}')
+    return table
+
+
+def _parsed(rows, names, delimiter) -> np.ndarray | None:
     try:
         table = np.loadtxt(rows, delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64)
     except ValueError:
-        table = None
-    if table is None or table.shape != (len(rows), len(names)):
-        raise MapError(f'{where}, {_complaint(rows, numbers, names, delimiter)}')
-    return table
+        return None
+    return table if table.shape == (len(rows), len(names)) else None
 
 
 def may_be_cut(rows: Sequence[str], delimiter: str | None = None) -> bool:
@@ -98,15 +105,21 @@ def _shape(text: str) -> tuple[int, int] | None:
 
 
 def _complaint(rows, numbers, names, delimiter) -> str:
-    wrong = [
-        (number, row, fault)
-        for number, row in zip(numbers, rows, strict=True)
-        if (fault := _fault(row.split(delimiter), names, delimiter))
-    ]
-    if not wrong:  # what NumPy refuses and Python does not, such as 1_000
+    wrong = []
+    for start in range(0, len(rows), CHUNK):
+        part = slice(start, start + CHUNK)
+        if _parsed(rows[part], names, delimiter) is not None:
+            continue
+        for number, row in zip(numbers[part], rows[part], strict=True):
+            if (fault := _fault(row.split(delimiter), names, delimiter)) is not None:
+                wrong.append((number, row, fault))
+        if len(wrong) > MOST_COUNTED:
+            break
+    if not wrong:  # what NumPy refuses and Python does not, such as digits of another script
         return f'line {numbers[0]}: not a table of plain numbers'
     number, row, fault = wrong[0]
-    return f"line {number}{fault}, in '{row.strip()[:80]}' ({len(wrong)} such lines)"
+    count = f'more than {MOST_COUNTED}' if len(wrong) > MOST_COUNTED else f'{len(wrong)}'
+    return f"line {number}{fault}, in '{row.strip()[:80]}' ({count} such lines)"
 
 
 def _fault(fields: list[str], names: Sequence[str], delimiter: str | None) -> str | None:
@@ -122,7 +135,7 @@ def _fault(fields: list[str], names: Sequence[str], delimiter: str | None) -> st
             return f', field {position}{name}: {_said_of_comma(field)}'
         return f", field {position}{name}: '{field[:40]}' is no number"
     if len(fields) != len(names):
-        return f': expected {len(names)} numbers ({",".join(names)}), got {len(fields)}'
+        return f': expected {len(names)} numbers ({",".join(names)[:80]}), got {len(fields)}'
     return None
 
 

@@ -161,6 +161,8 @@ def _viewpoint_notes(said: dict[str, list[str]], where: str) -> tuple[str, ...]:
 
 def _ascii(data: bytes, header: _Header, where: str) -> dict[str, np.ndarray]:
     start = header.size
+    if sum(field.count for field in header.fields) > len(data):  # before a name is made for each
+        raise _ends(0, header, where)
     text = text_of(data[start:], where)
     lines = text.split('\n')
     kept = [k for k, line in enumerate(lines) if line.strip()]

@@ -7,6 +7,7 @@ a count of its own per row. Every promise is compared with the bytes that are th
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import dataclass, field
 import re
 
@@ -23,6 +24,7 @@ from continuum_loc.mapping.formats.shapes import (
     check_rest,
     Cloud,
     cloud_of,
+    doubled,
     Mesh,
     mesh_of,
     require_columns,
@@ -85,6 +87,7 @@ class _Rows:
 
 def read_ply(data: bytes, where: str) -> Cloud | Mesh:
     """Read a cloud, or a mesh where there are faces. Raises MapError."""
+    data = data.removeprefix(codecs.BOM_UTF8)
     header = _header(data, where)
     named = {element.name: element for element in header.elements}
     if 'vertex' not in named:
@@ -166,8 +169,7 @@ def _check_elements(elements: list[_Element], where: str) -> None:
     lists = [[element.name for element in elements]]
     lists += [[canonical(one.name) for one in element.properties] for element in elements]
     for names in lists:
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
+        if twice := doubled(names):
             raise MapError(f'{where}: its header names {", ".join(twice)} twice')
     empty = [element.name for element in elements if not element.properties and element.count]
     if empty:

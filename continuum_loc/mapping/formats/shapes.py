@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -55,6 +56,11 @@ def _counted(row: int) -> str:
 def canonical(name: str) -> str:
     """Lower case, and our word for another program's."""
     return SYNONYMS.get(name.lower(), name.lower())
+
+
+def doubled(names: Iterable[str]) -> list[str]:
+    """Names that are there more than once."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def cloud_of(

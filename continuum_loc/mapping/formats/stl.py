@@ -7,6 +7,7 @@ size of the file decide what it is. The 80 bytes may begin with `solid` as an AS
 
 from __future__ import annotations
 
+import codecs
 import re
 
 from continuum_loc.errors import MapError
@@ -21,6 +22,7 @@ _FACET = ['facet', 'outer', 'vertex', 'vertex', 'vertex', 'endloop', 'endfacet']
 
 def read_stl(data: bytes, where: str) -> Mesh:
     """Read a mesh; its vertices are the triangles' corners, three each. Raises MapError."""
+    data = data.removeprefix(codecs.BOM_UTF8)
     count = int.from_bytes(data[80:HEAD], 'little')
     if len(data) >= HEAD and len(data) == HEAD + TRIANGLE * count:
         corners = np.frombuffer(data, _RECORD, count, HEAD)['corners'].reshape(-1, 3)

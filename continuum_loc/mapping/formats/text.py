@@ -24,6 +24,7 @@ from continuum_loc.mapping.formats.shapes import (
     canonical,
     Cloud,
     cloud_of,
+    doubled,
     NORMAL,
     require_columns,
     UNIT,
@@ -33,6 +34,7 @@ import numpy as np
 XYZ = ('x', 'y', 'z')
 COLOUR = ('red', 'green', 'blue')
 OWN = (*XYZ, *NORMAL, 'planarity')
+WIDEST = 1000  # columns; programs write some twenty
 VALID = (
     'x,y,z or x,y,z,nx,ny,nz or x,y,z,nx,ny,nz,planarity, or others under a first line of names'
 )
@@ -69,6 +71,8 @@ def read_text(data: bytes, where: str, fourth: str | None = None) -> Cloud:
     if not table.rows:
         raise MapError(f'{where}: holds no points')
     width = len(_fields(table.rows[0], table.delimiter))
+    if width > WIDEST:
+        raise MapError(f'{where}, {table.place(0)}: {width} columns; at most {WIDEST} are read')
     _check_first_line(table, width, where)
     names = table.names or [f'column {k + 1}' for k in range(width)]
     values = table_of(table.rows, table.numbers, names, where, table.delimiter)
@@ -137,8 +141,7 @@ def _names(line: str) -> list[str]:
 
 
 def _checked(names: list[str], where: str) -> list[str]:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := doubled(names):
         raise MapError(f'{where}: {", ".join(twice)} is named twice')
     try:
         require_columns(names, where)

@@ -18,7 +18,7 @@ class EstimatorNodeSettings(Settings):
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
     map: str = Field(  # noqa: A003  (a parameter's public name)
-        '', description='prior map: npz, PLY, PCD, XYZ, CSV or a mesh; empty for none'
+        '', description='prior map: npz, a cloud or a mesh (see docs/files.md); empty for none'
     )
     settings: str = Field(
         '',
