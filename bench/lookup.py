@@ -22,8 +22,10 @@ from continuum_loc.estimator.settings import load_estimator_settings
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.mapping.voxel_index import VoxelIndex
 from continuum_loc.measurements import TofFrame
+from continuum_loc.offline.localise import make_filter
 from continuum_loc.offline.replay import replay
-from continuum_loc.offline.trials import make_filter, measured, scene_map, Trial
+from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trials import measured, Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.scene.anomalies import Beams
 from continuum_loc.scene.reconstruct import reconstruct

@@ -18,7 +18,6 @@ from typing import Any
 
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.parallel import show_progress
-from studies._filter_runs import write_page
 from studies._input_case import (
     ACCEPTED,
     Case,
@@ -31,6 +30,7 @@ from studies._input_case import (
     UNCLEAR,
 )
 from studies._input_worker import all_cases, Worker
+from studies._pages import write_page
 
 LEAST = 300  # inputs
 MOST_MEMORY = 600  # MB that reading one of them may take: a bomb of 64 MB, and three copies of it
