@@ -57,6 +57,10 @@ class BagError(InputError):
     """A bag, or a folder of them, that cannot be read, written or judged."""
 
 
+class QueryError(InputError):
+    """An instant or a place of which an estimator can say nothing."""
+
+
 class TrajectoryError(InputError):
     """A trajectory, or a file of one."""
 

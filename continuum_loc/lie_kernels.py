@@ -95,10 +95,11 @@ def product(A, B, out):
     """Out (6, 6) = A B."""
     for i in range(6):
         for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += A[i, k] * B[k, j]
-            out[i, j] = total
+            out[i, j] = 0.0
+        for k in range(6):  # the innermost loop is over neighbours in memory
+            scale = A[i, k]
+            for j in range(6):
+                out[i, j] += scale * B[k, j]
 
 
 @kernel

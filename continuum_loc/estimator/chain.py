@@ -116,13 +116,11 @@ class Chain:
         step: int | None = None,
     ) -> np.ndarray:
         """
-        Covariances (G, size, size) of A x + B x' of the offsets x of a column and x' of the next.
+        Covariance (m, m) of A x + B x', with the offsets x of a column and x' of the next one.
 
-        A, B (m, D). Of groups of `size` rows that begin every `step` rows; without them (m, m), of
-        all rows.
-
-        With the chain's Cholesky factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and X is zero
-        above `column`: the cost grows with the columns after it, not with the window.
+        A, B: (m, D). With `size`, those (G, size, size) of groups of so many rows, which begin
+        every `step` rows. With the chain's factor C (C C^T = H) it is X^T X, X = C^-1 [A B]^T, and
+        X is zero above `column`: the cost grows with the columns after it, not with the window.
         """
         groups = (size or len(A), step or len(A))
         X = self._factor(column).whiten(np.ascontiguousarray(A.T))
@@ -139,7 +137,7 @@ class Chain:
         """
         C^T H^-1 C (S, S) for C (K, D, S) over all columns, with H the chain's information.
 
-        One forward substitution: y_k = L_k^-1 (C_k - Y_k-1^T y_k-1), the sum of y_k^T y_k.
+        It takes one forward substitution: sum y_k^T y_k with y_k = L_k^-1 (C_k - Y_k-1^T y_k-1).
         """
         total, right = np.zeros((C.shape[2], C.shape[2])), C[0]
         for k in range(len(C)):

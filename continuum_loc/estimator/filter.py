@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from operator import itemgetter
 import time as clock
 
-from continuum_loc.errors import MeasurementError, SingularError
+from continuum_loc.errors import MeasurementError, QueryError, SingularError
 from continuum_loc.estimate import Estimate, Status
 from continuum_loc.estimator.cycle import Cycle
 from continuum_loc.estimator.doubts import Doubts
@@ -101,12 +101,12 @@ class SlidingWindowFilter:
 
         Inside the window, behind it as far as `history` reaches (smoothed by the knots that
         followed), and ahead of it at constant body-frame velocity, with a covariance that grows.
-        Raises ValueError beyond these.
+        Raises QueryError beyond these.
         """
         if self.epoch is None or not self.window.intervals:
-            raise ValueError('nothing was estimated yet: process measurements first')
+            raise QueryError('nothing was estimated yet: process measurements first')
         if not 0.0 <= s <= self.robot.length:
-            raise ValueError(f'arclength {s} m is off the body; valid: 0 to {self.robot.length} m')
+            raise QueryError(f'arclength {s} m is off the body; valid: 0 to {self.robot.length} m')
         time = seconds(stamp, self.epoch)
         state = state_at(self.window, self.history, time, s)
         if time >= self.window.columns[0].time:
@@ -117,7 +117,7 @@ class SlidingWindowFilter:
         """
         Linearise the whole window anew until it converges; its estimates at `stamps` [ns].
 
-        Raises ValueError for a stamp outside the window.
+        Raises QueryError for a stamp outside the window.
         """
         started = clock.perf_counter()
         first, last = self.window.columns[0].time, seconds(self.newest, self.epoch)
@@ -128,7 +128,7 @@ class SlidingWindowFilter:
             for stamp in stamps:
                 time = seconds(stamp, self.epoch)
                 if not first - TIME_EPSILON <= time <= last + TIME_EPSILON:
-                    raise ValueError(
+                    raise QueryError(
                         f'stamp {stamp} is outside the window, '
                         f'{self.epoch + nanoseconds(first)} to {self.newest} ns'
                     )

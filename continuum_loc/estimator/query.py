@@ -1,26 +1,24 @@
-"""
-Mean and covariance of the state at any time and arclength.
-
-In the window, behind it and ahead of it.
-"""
+"""Mean and covariance of the state at any time, in the window, behind or ahead, and arclength."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from continuum_loc import lie
+from continuum_loc.errors import QueryError
 from continuum_loc.estimator import gp
-from continuum_loc.estimator.interpolation import body_between, BodyState
+from continuum_loc.estimator.interpolation import body_between, BodyState, interpolated, MOTION
 from continuum_loc.estimator.state import (
     Column,
-    ends_in_time,
+    ends_along,
     Grid,
     NODE_DIM,
-    POSE,
-    STRAIN,
+    POSE_PART,
+    STRAIN_PART,
     TIME_EPSILON,
-    VELOCITY,
+    VELOCITY_PART,
 )
 from continuum_loc.estimator.window import Window
 import numpy as np
@@ -31,10 +29,9 @@ SMOOTHED_BY = 2  # knots
 @dataclass(frozen=True, slots=True, eq=False)
 class PastColumn:
     """
-    A column of the past.
+    A column behind the window, with the covariance (N - 1, 36, 36) of each two neighbouring nodes.
 
-    covariance (N - 1, 36, 36) of each neighbouring pair of nodes; jerked (N,): what the process
-    noise was multiplied by in the interval that follows.
+    jerked (N,): what the process noise was multiplied by in the interval that follows.
     """
 
     column: Column
@@ -50,11 +47,7 @@ class History:
         self._columns: deque[PastColumn] = deque()
 
     def note(self, window: Window) -> None:
-        """
-        Keep a column once `SMOOTHED_BY` later ones have smoothed it.
-
-        More of them would change it little and cost much.
-        """
+        """Keep a column once `SMOOTHED_BY` later ones are there; more would change little."""
         k = len(window.columns) - 1 - SMOOTHED_BY
         if self._duration <= 0.0 or k < 0:
             return
@@ -68,44 +61,33 @@ class History:
             self._columns.popleft()
 
     def around(self, time: float) -> tuple[PastColumn, PastColumn]:
-        """
-        Return the two columns that enclose `time`.
-
-        Raises ValueError where there are none.
-        """
+        """Return the two columns that enclose `time`; raises QueryError where there are none."""
         for older, newer in zip(self._columns, list(self._columns)[1:], strict=False):
             if older.column.time - TIME_EPSILON <= time <= newer.column.time + TIME_EPSILON:
                 return older, newer
-        reach = (
-            f'{self._columns[0].column.time:.3f} s'
-            if self._columns
-            else 'no time behind the window'
-        )
-        raise ValueError(f'time {time:.3f} s is not kept; the history reaches back to {reach}')
+        reach = f'{self._columns[0].column.time:.3f} s' if self._columns else 'no time at all'
+        raise QueryError(f'time {time:.3f} s is not kept; the history reaches back to {reach}')
+
+
+class Pair(NamedTuple):
+    """Two neighbouring nodes: T (2, 4, 4), strain and velocity (2, 6), covariance (36, 36)."""
+
+    T: np.ndarray
+    strain: np.ndarray
+    velocity: np.ndarray
+    covariance: np.ndarray
 
 
 def state_at(window: Window, history: History, time: float, s: float) -> BodyState:
     """Evaluate the state at `time` [s since the epoch] and arclength s [m]."""
     n, offset = window.grid.segment(s)
     if time > window.columns[-1].time:
-        T, strain, velocity, P = _ahead(window, time, n)
+        pair = _ahead(window, time, n)
     elif time >= window.columns[0].time:
-        T, strain, velocity, P = _inside(window, time, n)
+        pair = _inside(window, time, n)
     else:
-        T, strain, velocity, P = _behind(window, history, time, n)
-    return _along(window.grid, n, offset, T, strain, velocity, P, window.priors.strain_psd[n])
-
-
-def _inside(window: Window, time: float, n: int):
-    k = window.knot_before(time)
-    A = _rows_of(window, n)
-    P = window.chain.covariance(k, np.concatenate([A, 0.0 * A]), np.concatenate([0.0 * A, A]))
-    return _between(window, k, P, time, n)
-
-
-def _six(at: int) -> slice:
-    """Rows or columns of one part of a node, of which `at` is the first."""
-    return slice(at, at + 6)
+        pair = _behind(window, history, time, n)
+    return _along(window.grid, n, offset, pair, window.priors.strain_psd[n])
 
 
 def _rows_of(window: Window, n: int) -> np.ndarray:
@@ -113,37 +95,48 @@ def _rows_of(window: Window, n: int) -> np.ndarray:
     return np.eye(2 * NODE_DIM, window.grid.dim, NODE_DIM * n)
 
 
-def _behind(window: Window, history: History, time: float, n: int):
+def _inside(window: Window, time: float, n: int) -> Pair:
+    k, m, A = window.knot_before(time), NODE_DIM, _rows_of(window, n)
+    P = window.chain.covariance(k, np.concatenate([A, 0.0 * A]), np.concatenate([0.0 * A, A]))
+    a, b, nodes = window.column(k), window.column(k + 1), np.arange(n, n + 2)
+    u = (time - a.time) / (b.time - a.time)
+    at = interpolated(a, b, np.full(2, time - a.time), nodes, pose=True, rate=True)
+    J, ends = np.zeros((2 * m, 4 * m)), np.concatenate([MOTION, 2 * m + MOTION])
+    for i in range(2):
+        both = np.concatenate([at.J_pose[i], at.J_rate[i]])
+        J[np.ix_(m * i + MOTION, m * i + ends)] = both
+        strain = m * i + np.arange(m)[STRAIN_PART]
+        J[strain, strain], J[strain, 2 * m + strain] = 1.0 - u, u
+    open_ = _open_bridge(window, a, b, time, n, window.intervals[k].jerked)
+    strain = (1.0 - u) * a.strain[nodes] + u * b.strain[nodes]
+    return Pair(at.T, strain, at.v, J @ P @ J.T + open_)
+
+
+def _behind(window: Window, history: History, time: float, n: int) -> Pair:
     older, newer = history.around(time)
     # Neighbouring columns are strongly correlated; each one's own covariance at both ends, taken
     # as fully correlated, is the larger of the two readings and so the safe one.
     u = (time - older.column.time) / (newer.column.time - older.column.time)
     P = (1.0 - u) * older.covariance[n] + u * newer.covariance[n]
-    body = body_between(older.column, newer.column, time)
-    nodes = slice(n, n + 2)
+    body, nodes = body_between(older.column, newer.column, time), slice(n, n + 2)
     P = P + _open_bridge(window, older.column, newer.column, time, n, older.jerked)
-    return body.T[nodes], body.strain[nodes], body.velocity[nodes], P
+    return Pair(body.T[nodes], body.strain[nodes], body.velocity[nodes], P)
 
 
-def _between(window: Window, k: int, P: np.ndarray, time: float, n: int):
-    """Two nodes at `time` in interval k, and their joint covariance (36, 36)."""
-    a, b = window.column(k), window.column(k + 1)
-    d, tau = b.time - a.time, time - a.time
-    u, m = tau / d, NODE_DIM
-    J = np.zeros((2 * m, 4 * m))
-    T, velocity = np.empty((2, 4, 4)), np.empty((2, 6))
+def _ahead(window: Window, time: float, n: int) -> Pair:
+    """Predict from the newest column at constant body-frame velocity."""
+    newest, dt = window.column(-1), time - window.columns[-1].time
+    k, m = len(window.intervals) - 1, NODE_DIM
+    P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
+    later, J = newest.predict(dt), np.eye(2 * m)
     for i in range(2):
-        T[i], velocity[i], J_pose, J_rate = gp.interpolate(ends_in_time(a, b, n + i), tau)
-        for rows, part in ((POSE, J_pose), (VELOCITY, J_rate)):
-            for block, column in enumerate((POSE, VELOCITY, 2 * m + POSE, 2 * m + VELOCITY)):
-                J[_six(m * i + rows), _six(m * i + column)] = part[:, _six(6 * block)]
-        at = m * i + STRAIN
-        J[_six(at), _six(at)] = (1.0 - u) * np.eye(6)
-        J[_six(at), _six(2 * m + at)] = u * np.eye(6)
+        twist, own = dt * newest.velocity[n + i], J[m * i : m * i + m, m * i : m * i + m]
+        own[POSE_PART, POSE_PART] = lie.adjoint(lie.exp(-twist))
+        own[POSE_PART, VELOCITY_PART] = dt * lie.right_jacobian(twist)
+    growth = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
     nodes = slice(n, n + 2)
-    strain = (1.0 - u) * a.strain[nodes] + u * b.strain[nodes]
-    open_ = _open_bridge(window, a, b, time, n, window.intervals[k].jerked)
-    return T, strain, velocity, J @ P @ J.T + open_
+    covariance = J @ P @ J.T + _process_noise(window, n, window.intervals[k].jerked, growth, dt)
+    return Pair(later.T[nodes], later.strain[nodes], later.velocity[nodes], covariance)
 
 
 def _open_bridge(
@@ -164,54 +157,30 @@ def _process_noise(
     """
     Q, psd = np.zeros((2 * NODE_DIM, 2 * NODE_DIM)), window.priors.velocity_psd
     for i in range(2):
-        start = NODE_DIM * i
-        at = start + np.concatenate([np.arange(POSE, POSE + 6), np.arange(VELOCITY, VELOCITY + 6)])
+        at = NODE_DIM * i + MOTION
         Q[np.ix_(at, at)] = np.kron(motion, np.diag(jerked[n + i] * psd[n + i]))
-        at = start + np.arange(STRAIN, STRAIN + 6)
+        at = NODE_DIM * i + np.arange(NODE_DIM)[STRAIN_PART]
         Q[at, at] = jerked[n + i] * strain / window.priors.inverse_strain_rate_psd
     return Q
 
 
-def _ahead(window: Window, time: float, n: int):
-    """Two nodes predicted from the newest column at constant body-frame velocity."""
-    newest, dt = window.column(-1), time - window.columns[-1].time
-    k, m = len(window.intervals) - 1, NODE_DIM
-    P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
-    later = newest.predict(dt)
-    J = np.eye(2 * m)
-    for i in range(2):
-        twist, at = dt * newest.velocity[n + i], m * i
-        J[_six(at), _six(at)] = lie.adjoint(lie.exp(-twist))
-        J[_six(at), _six(at + VELOCITY)] = dt * lie.right_jacobian(twist)
-    growth = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-    nodes = slice(n, n + 2)
-    covariance = J @ P @ J.T + _process_noise(window, n, window.intervals[k].jerked, growth, dt)
-    return later.T[nodes], later.strain[nodes], later.velocity[nodes], covariance
-
-
-def _along(grid: Grid, n: int, offset: float, T, strain, velocity, P, strain_psd) -> BodyState:
+def _along(grid: Grid, n: int, offset: float, pair: Pair, strain_psd: np.ndarray) -> BodyState:
     """
     From two nodes to an arclength between them.
 
     Pose and strain by the same Hermite in s, velocity linearly in the frames that the exact
     adjoint carries from the nearer node.
     """
-    ds, m = grid.s[n + 1] - grid.s[n], NODE_DIM
-    T_s, strain_s, J_pose, J_rate = gp.interpolate(
-        gp.Ends(T[0], strain[0], T[1], strain[1], ds), offset
-    )
+    ends, m = ends_along(pair.T, pair.strain, grid.s[n : n + 2], 0), NODE_DIM
+    at, u = gp.interpolate(ends, offset), offset / ends.span
     J = np.zeros((m, 2 * m))
-    for rows, part in ((POSE, J_pose), (STRAIN, J_rate)):
-        for block, column in enumerate((POSE, STRAIN, m + POSE, m + STRAIN)):
-            J[_six(rows), _six(column)] = part[:, _six(6 * block)]
-    u = offset / ds
+    J[:12, :12], J[:12, m : m + 12] = np.split(np.concatenate([at.J_pose, at.J_rate]), 2, axis=1)
     carried = [
-        weight * lie.adjoint(lie.inverse(T_s) @ T_node)
-        for weight, T_node in zip((1.0 - u, u), T, strict=True)
+        weight * lie.adjoint(lie.inverse(at.T) @ T_node)
+        for weight, T_node in zip((1.0 - u, u), pair.T, strict=True)
     ]
-    J[_six(VELOCITY), _six(VELOCITY)], J[_six(VELOCITY), _six(m + VELOCITY)] = carried
-    covariance = J @ P @ J.T
-    covariance[:12, :12] += np.kron(gp.bridge(offset, ds), np.diag(strain_psd))
-    return BodyState(
-        T_s, strain_s, carried[0] @ velocity[0] + carried[1] @ velocity[1], covariance
-    )
+    J[VELOCITY_PART, :m][:, VELOCITY_PART], J[VELOCITY_PART, m:][:, VELOCITY_PART] = carried
+    covariance = J @ pair.covariance @ J.T
+    covariance[:12, :12] += np.kron(gp.bridge(offset, ends.span), np.diag(strain_psd))
+    velocity = carried[0] @ pair.velocity[0] + carried[1] @ pair.velocity[1]
+    return BodyState(at.T, at.v, velocity, covariance)

@@ -24,7 +24,7 @@ def smooth(
     Estimates at `stamps` [ns] from all measurements at once; memory grows with the recording.
 
     The filter with an endless window gives the start; then everything is linearised anew until it
-    converges. Raises ValueError for a stamp outside the recording.
+    converges. Raises QueryError for a stamp outside the recording.
     """
     filter_ = SlidingWindowFilter(
         robot,

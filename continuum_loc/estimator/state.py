@@ -20,7 +20,7 @@ TIME_EPSILON = 1e-9  # [s] stamps are integer nanoseconds
 NODE_DIM = 18
 STEP_LENGTH = 0.004  # [m] over which strain may step at a module's end
 POSE, STRAIN, VELOCITY = 0, 6, 12  # offsets of a node's parts
-POSE_PART, VELOCITY_PART = slice(0, 6), slice(12, 18)
+POSE_PART, STRAIN_PART, VELOCITY_PART = slice(0, 6), slice(6, 12), slice(12, 18)
 
 
 class Grid:
