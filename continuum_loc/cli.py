@@ -32,6 +32,7 @@ import typer
 
 if TYPE_CHECKING:
     from continuum_loc.offline.claims import Claim
+    from continuum_loc.offline.tune import Trying
 
 OK, FAILED, USAGE = 0, 1, 2
 
@@ -247,11 +248,8 @@ def replay(
 
     description, duration = load_robot(robot), _bag_duration(bag)
     chosen = settings_of(description.name, settings)
-    if map_file is None and scene is None and description.tof and chosen.tof.enabled:
-        raise MapError(
-            f"robot '{description.name}' has ToF sensors, which need a prior map: give `--map "
-            'FILE`, or `--scene NAME` for the map of a scene of the simulator'
-        )
+    if description.tof and chosen.tof.enabled:
+        _require_map(description.name, map_file, scene)
     with _busy() as status:
         status.update('loading the prior map')
         if map_file is None and scene is not None:
@@ -349,6 +347,14 @@ def repair(
         console.print(line, highlight=False, soft_wrap=True)
 
 
+def _require_map(robot: str, map_file: Path | None, scene: str | None) -> None:
+    if map_file is None and scene is None:
+        raise MapError(
+            f"robot '{robot}' has ToF sensors, which need a prior map: give `--map FILE`, or "
+            '`--scene NAME` for the map of a scene of the simulator'
+        )
+
+
 @app.command()
 def tune(
     out: Annotated[Path, typer.Argument(help='settings file to write (YAML)')],
@@ -404,14 +410,17 @@ def tune(
             tell=lambda one: progress.advance(task),
         )
     dump_settings(best, out)
-    best_tried = min(tried, key=lambda one: one.cost)
-    for name, one in (('start', tried[0]), ('best', best_tried)):
+    _tell_sweep(tried[0], min(tried, key=lambda one: one.cost))
+    console.print(f'written {out}')
+
+
+def _tell_sweep(start: Trying, best: Trying) -> None:
+    for name, one in (('start', start), ('best', best)):
         console.print(
             f'{name:6}{100 * one.translation_rmse_m:.3f} cm  {one.rotation_rmse_deg:.3f} deg  '
             f'NEES/dof {one.nees_per_dof:.2f}',
             highlight=False,
         )
-    console.print(f'written {out}')
 
 
 @app.command()
@@ -490,10 +499,7 @@ def evaluate(
     from continuum_loc.offline.runs import new_run
 
     if name is None:
-        require_research()
-        from studies import study_names
-
-        console.print('studies: ' + ', '.join([*study_names(), 'bags DIR']))
+        _list_studies()
         return
     if name == 'bags' and (folder is None or map_file is None):
         raise typer.BadParameter('bags needs a folder and a map: evaluate bags DIR --map FILE')
@@ -512,11 +518,23 @@ def evaluate(
         claims = soak(out, 60.0 * minutes, seed)
     else:
         claims = _run_study(name, run, out, quick, seed, jobs)
+    raise typer.Exit(_tell_claims(name, claims, out))
+
+
+def _list_studies() -> None:
+    require_research()
+    from studies import study_names
+
+    console.print('studies: ' + ', '.join([*study_names(), 'bags DIR']))
+
+
+def _tell_claims(name: str, claims: list[Claim], out: Path) -> int:
+    """Print what a study claims and what it lost; the exit code."""
     console.print(_claims_table(claims))
     for trial, error in _failed(out, name).items():
         errors.print(f'[bold red]failed:[/] {escape(f"{trial}: {error}")}', highlight=False)
     console.print(f'results {out}')
-    raise typer.Exit(OK if all(claim.holds for claim in claims) else FAILED)
+    return OK if all(claim.holds for claim in claims) else FAILED
 
 
 def _run_study(name: str, run: Any, out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:

@@ -140,7 +140,6 @@ def component_figure(found: Errors, epoch: int) -> go.Figure:
 
     A menu in the figure chooses the ring.
     """
-    import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
     figure = make_subplots(
@@ -153,49 +152,49 @@ def component_figure(found: Errors, epoch: int) -> go.Figure:
             COMPONENTS[i] for pair in zip(range(3), range(3, 6), strict=True) for i in pair
         ],
     )
-    time = (found.stamps - epoch) / NANOSECONDS
-    last = len(found.names) - 1
-    scale = np.array([100.0] * 3 + [np.degrees(1.0)] * 3)
-    for ring in range(1, last + 1):
+    for ring in range(1, len(found.names)):
         for component in range(6):
-            values, band = (
-                scale[component] * array[:, ring, component]
-                for array in (found.pose, 3.0 * found.sigma)
-            )
-            band = np.minimum(band, ceiling(np.abs(values), band))
-            kept = thin(np.abs(values))
-            x = np.concatenate([time[kept], time[kept][::-1]])
             place = {'row': component % 3 + 1, 'col': component // 3 + 1}
-            figure.add_trace(
-                go.Scatter(
-                    x=x,
-                    y=_compact(np.concatenate([band[kept], -band[kept][::-1]])),
-                    fill='toself',
-                    fillcolor='rgba(136,150,168,0.22)',
-                    line={'width': 0},
-                    hoverinfo='skip',
-                    visible=ring == last,
-                    showlegend=False,
-                ),
-                **place,
-            )
-            figure.add_trace(
-                go.Scatter(
-                    x=time[kept],
-                    y=_compact(values[kept]),
-                    mode='lines',
-                    visible=ring == last,
-                    line={'width': 1.3, 'color': RING_COLOURS[(ring - 1) % len(RING_COLOURS)]},
-                    showlegend=False,
-                    hovertemplate='%{y:.3g}<extra></extra>',
-                ),
-                **place,
-            )
+            for trace in _component_traces(found, epoch, ring, component):
+                figure.add_trace(trace, **place)
     figure.update_layout(updatemenus=[_ring_menu(found.names[1:])])
     figure.update_yaxes(title_text='cm', col=1)
     figure.update_yaxes(title_text='deg', col=2)
     figure.update_xaxes(title_text='time [s]', row=3)
     return styled(figure, 560, top=70)
+
+
+def _component_traces(
+    found: Errors, epoch: int, ring: int, component: int
+) -> tuple[go.Scatter, go.Scatter]:
+    """Draw the 3-sigma band and the error of one component of a ring, in cm or degrees."""
+    import plotly.graph_objects as go
+
+    time = (found.stamps - epoch) / NANOSECONDS
+    scale = 100.0 if component < 3 else np.degrees(1.0)
+    values, band = (scale * array[:, ring, component] for array in (found.pose, 3.0 * found.sigma))
+    band = np.minimum(band, ceiling(np.abs(values), band))
+    kept = thin(np.abs(values))
+    shown = {'visible': ring == len(found.names) - 1, 'showlegend': False}
+    return (
+        go.Scatter(
+            x=np.concatenate([time[kept], time[kept][::-1]]),
+            y=_compact(np.concatenate([band[kept], -band[kept][::-1]])),
+            fill='toself',
+            fillcolor='rgba(136,150,168,0.22)',
+            line={'width': 0},
+            hoverinfo='skip',
+            **shown,
+        ),
+        go.Scatter(
+            x=time[kept],
+            y=_compact(values[kept]),
+            mode='lines',
+            line={'width': 1.3, 'color': RING_COLOURS[(ring - 1) % len(RING_COLOURS)]},
+            hovertemplate='%{y:.3g}<extra></extra>',
+            **shown,
+        ),
+    )
 
 
 def _ring_menu(names: tuple[str, ...]) -> dict:

@@ -148,38 +148,13 @@ def run_live(
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda stage, share: None)
-    environment, domain = _environment(), Domain()
-    common = {'robot': robot}
-    started: list[_Process] = []
-    listeners: list[_Process] = []
-
-    def start(node: str, **parameters: Any) -> _Process:
-        path = folder / f'{node}.json'
-        path.unlink(missing_ok=True)
-        started.append(
-            _Process(node, parameters | {'summary_file': str(path)}, folder, environment, domain)
-        )
-        return started[-1]
-
-    try:
+    with _Graph(folder) as graph:
         tell('starting the nodes', 0.0)
-        # The simulator publishes reliably, so on a busy machine nothing need be lost on the way.
-        if record:
-            listeners.append(start('recorder', bag=str(folder / 'bag'), reliable_inputs=True))
-        estimator = start(
-            'estimator',
-            map=str(prior_map),
-            settings=settings,
-            **{'intake.reliable_inputs': True},
-            **common,
-        )
-        for recorder in listeners:
-            recorder.await_log('recording', START_LIMIT)
-        estimator.await_log('ready:', START_LIMIT)
-        listeners.append(estimator)
+        listeners = _listeners(graph, record, robot, prior_map, settings)
         # The simulator holds its data back until all of them listen to it.
-        simulator = start(
+        simulator = graph.start(
             'simulator',
+            robot=robot,
             scene=scene,
             trajectory=trajectory,
             duration=float(duration),
@@ -187,17 +162,59 @@ def run_live(
             profile=profile,
             tof_fidelity=tof_fidelity,
             wait_for=len(listeners),
-            **common,
         )
         _follow(simulator, listeners, duration, tell, watch)
         time.sleep(0.5)  # the last estimate is still on its way into the bag
         for process in (simulator, *reversed(listeners)):
             process.stop()
-    finally:
-        for process in started:
+    return _result(folder, record, tuple(process.log for process in graph.started))
+
+
+class _Graph:
+    """Nodes in a ROS domain of their own; none is left behind."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self._environment = folder, _environment()
+        self._domain = Domain()
+        self.started: list[_Process] = []
+
+    def __enter__(self) -> _Graph:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for process in self.started:
             process.kill()
-        domain.close()
-    return _result(folder, record, tuple(process.log for process in started))
+        self._domain.close()
+
+    def start(self, node: str, **parameters: Any) -> _Process:
+        """Start a node that writes its summary into the folder."""
+        path = self.folder / f'{node}.json'
+        path.unlink(missing_ok=True)
+        parameters['summary_file'] = str(path)
+        self.started.append(
+            _Process(node, parameters, self.folder, self._environment, self._domain)
+        )
+        return self.started[-1]
+
+
+def _listeners(
+    graph: _Graph, record: bool, robot: str, prior_map: str | Path, settings: str
+) -> list[_Process]:
+    """Start what listens to the sensors: the recorder, where one is wanted, and the estimator."""
+    # The simulator publishes reliably, so on a busy machine nothing need be lost on the way.
+    bag = str(graph.folder / 'bag')
+    listeners = [graph.start('recorder', bag=bag, reliable_inputs=True)] if record else []
+    estimator = graph.start(
+        'estimator',
+        robot=robot,
+        map=str(prior_map),
+        settings=settings,
+        **{'intake.reliable_inputs': True},
+    )
+    for recorder in listeners:
+        recorder.await_log('recording', START_LIMIT)
+    estimator.await_log('ready:', START_LIMIT)
+    return [*listeners, estimator]
 
 
 def _follow(

@@ -117,9 +117,8 @@ def reconstruct(
     """
     stack = _stacked(robot, frames, trajectory)
     T_ring_sensor = np.stack([sensor.mount.T_ring_sensor for sensor in robot.tof])[stack.sensor]
-    rings = np.array([robot.ring_names.index(sensor.ring) + 1 for sensor in robot.tof])[
-        stack.sensor
-    ]
+    ring_of = np.array([robot.ring_names.index(sensor.ring) + 1 for sensor in robot.tof])
+    rings = ring_of[stack.sensor]
     T_map_ring, pose_covariance = trajectory.rings_at(stack.stamps, rings)
     T_map_sensor = T_map_ring @ T_ring_sensor
     in_map = (
@@ -132,14 +131,13 @@ def reconstruct(
     frame_of, zone = np.nonzero(stack.usable & ~itself)
     covariance = np.empty((len(frame_of), 3, 3))
     for start in range(0, len(frame_of), CHUNK):
-        part = slice(start, start + CHUNK)
-        own = frame_of[part]
-        covariance[part] = _point_covariance(
+        own, zones = (which[start:][:CHUNK] for which in (frame_of, zone))
+        covariance[start:][:CHUNK] = _point_covariance(
             T_map_ring[own, :3, :3],
             pose_covariance[own],
             T_ring_sensor[own],
-            stack.points[own, zone[part]],
-            stack.sigma[own, zone[part]],
+            stack.points[own, zones],
+            stack.sigma[own, zones],
             floor,
             np.radians(beam_width_deg),
         )
