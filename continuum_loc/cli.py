@@ -267,13 +267,9 @@ def replay(
             strict=strict,
             progress=progress,
         )
-    configuration = {
-        'robot': description,
-        'bag': bag,
-        'map': {} if map_file is None else {'file': map_file},
-        'scene': scene,
-        'estimator': estimator.settings,
-    }
+    used = {} if map_file is None else {'file': map_file}
+    configuration = {'robot': description, 'bag': bag, 'map': used, 'scene': scene}
+    configuration['estimator'] = estimator.settings
     folder = new_run('replay', out)
     summary = save_run(folder, result, kind='replay', seed=seed, configuration=configuration)
     raise typer.Exit(USAGE if _tell(folder, summary) else OK)
@@ -501,10 +497,7 @@ def evaluate(
     if name is None:
         _list_studies()
         return
-    if name == 'bags' and (folder is None or map_file is None):
-        raise typer.BadParameter('bags needs a folder and a map: evaluate bags DIR --map FILE')
-    if minutes is not None and name != 'soak':
-        raise typer.BadParameter('--minutes goes with soak')
+    _check_study_options(name, folder, map_file, minutes)
     run = None if name == 'bags' else _study(name)
     out = out or new_run(name)
     out.mkdir(parents=True, exist_ok=True)
@@ -512,13 +505,18 @@ def evaluate(
     _choose_worlds(worlds or [])
     if run is None:
         claims = _evaluate_bags(folder, robot, map_file, settings, out, jobs)
-    elif minutes is not None:
-        from studies.soak import soak
-
-        claims = soak(out, 60.0 * minutes, seed)
     else:
-        claims = _run_study(name, run, out, quick, seed, jobs)
+        claims = _run_study(name, run, out, quick, seed, jobs, minutes)
     raise typer.Exit(_tell_claims(name, claims, out))
+
+
+def _check_study_options(
+    name: str, folder: Path | None, map_file: Path | None, minutes: float | None
+) -> None:
+    if name == 'bags' and (folder is None or map_file is None):
+        raise typer.BadParameter('bags needs a folder and a map: evaluate bags DIR --map FILE')
+    if minutes is not None and name != 'soak':
+        raise typer.BadParameter('--minutes goes with soak')
 
 
 def _list_studies() -> None:
@@ -537,10 +535,22 @@ def _tell_claims(name: str, claims: list[Claim], out: Path) -> int:
     return OK if all(claim.holds for claim in claims) else FAILED
 
 
-def _run_study(name: str, run: Any, out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
+def _run_study(
+    name: str,
+    run: Any,
+    out: Path,
+    quick: bool,
+    seed: int,
+    jobs: int,
+    minutes: float | None,
+) -> list[Claim]:
     """Run a study; one that is reported is entered into the books, unless it is a quick run."""
     from studies import _books as books
 
+    if minutes is not None:
+        from studies.soak import soak
+
+        return soak(out, 60.0 * minutes, seed)
     if quick:
         return run(out, quick, seed, jobs)
     books.require_book(name)
