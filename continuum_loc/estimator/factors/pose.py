@@ -91,10 +91,6 @@ class InsertionFactor(_PoseFactor):
     name = 'insertion'
     consumes = EncoderSample
 
-    @classmethod
-    def wanted(cls, setup):
-        return True
-
     def row(self, measurement: EncoderSample) -> Row:
         insertion = self.robot.base.insertion
         if insertion.mode != 'measured':
