@@ -164,10 +164,6 @@ class HeightFactor(Factor):
     batch = HeightBatch
     sigma = 1e-3
 
-    @classmethod
-    def wanted(cls, setup):
-        return True
-
     def row(self, measurement):
         return HeightRow(measurement.z)
 

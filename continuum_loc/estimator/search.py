@@ -49,6 +49,14 @@ class Snapshot(NamedTuple):
         return Snapshot(*(part[self.nodes == node] for part in self))
 
 
+class Beam(NamedTuple):
+    """Partial bodies (M): pose (4, 4) of the end, cost, and curvature (2,) of each segment."""
+
+    T: np.ndarray
+    cost: np.ndarray
+    bends: np.ndarray
+
+
 class ShapeSearch:
     """Beam search over bent shapes for the ones that a snapshot fits."""
 
@@ -82,28 +90,28 @@ class ShapeSearch:
 
     def find(self, T_map_base: np.ndarray, snapshot: Snapshot) -> list[np.ndarray]:
         """Strain (N, 6) at the nodes of the best shapes, best first."""
-        T, cost, bends = T_map_base[None], np.zeros(1), np.zeros((1, 0, 2))
+        beam = Beam(T_map_base[None], np.zeros(1), np.zeros((1, 0, 2)))
         for node, length in zip(self._nodes[1:], np.diff(self._s), strict=True):
-            T, cost, bends = self._extend(T, cost, bends, length, snapshot.at(node))
-        return [self._strain_at_nodes(bend) for bend in bends[: self.settings.refined]]
+            beam = self._extend(beam, length, snapshot.at(node))
+        return [self._strain_at_nodes(bend) for bend in beam.bends[: self.settings.refined]]
 
-    def _extend(self, T, cost, bends, length, snapshot):
+    def _extend(self, beam: Beam, length: float, snapshot: Snapshot) -> Beam:
         """Add a segment to every partial body in every way, and keep the best."""
-        parents, grid = len(T), len(self.curvatures)
+        bends, parents, grid = beam.bends, len(beam.T), len(self.curvatures)
         strain = np.tile(self.rest, (grid, 1))
         strain[:, 4:] += self.curvatures
-        ends = (T[:, None] @ lie.exp(length * strain)[None]).reshape(-1, 4, 4)
+        ends = (beam.T[:, None] @ lie.exp(length * strain)[None]).reshape(-1, 4, 4)
         scores = _score(ends, snapshot, self._surface, self._rules)
         before = bends[:, -1] if bends.shape[1] else np.zeros((parents, 2))
         change = np.sum((self.curvatures[None] - before[:, None]) ** 2, axis=2) / (
             self._bending_psd * length
         )
-        total = (cost[:, None] + 0.5 * change).ravel() + scores
+        total = (beam.cost[:, None] + 0.5 * change).ravel() + scores
         chosen = self._different(total, ends)
         grown = np.concatenate(
             [bends[chosen // grid], self.curvatures[chosen % grid][:, None]], axis=1
         )
-        return ends[chosen], total[chosen], grown
+        return Beam(ends[chosen], total[chosen], grown)
 
     def _different(self, total: np.ndarray, T: np.ndarray) -> np.ndarray:
         """Best `beam` candidates, no two of which lie within `distinct` of one another."""

@@ -107,8 +107,8 @@ class Factor(ABC):
 
     @classmethod
     def wanted(cls, setup: Setup) -> bool:
-        """Whether a filter of this setup has such a factor."""
-        return getattr(setup.settings, cls.name).enabled
+        """Whether a filter of this setup has such a factor: unless its settings switch it off."""
+        return getattr(getattr(setup.settings, cls.name, None), 'enabled', True)
 
     @abstractmethod
     def row(self, measurement: Any) -> tuple:

@@ -119,10 +119,6 @@ class InsertionFactor(_PoseFactor):
     def __init__(self, setup):
         super().__init__(setup, ['insertion'])
 
-    @classmethod
-    def wanted(cls, setup):
-        return True
-
     def row(self, measurement: EncoderSample) -> Row:
         insertion = self.robot.base.insertion
         if insertion.mode != 'measured':
