@@ -756,15 +756,13 @@ def _describe_map(path: Path, prior: Any) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    _say(path, (*prior.notes, *size_note(prior)))
+    _say(path, (*prior.notes, *size_note(prior)), console)
 
 
-def _say(path: Path, notes: Iterable[str]) -> None:
+def _say(path: Path, notes: Iterable[str], to: Console = errors) -> None:
     """Print what there is to know about a file that was read."""
     for note in notes:
-        errors.print(
-            f'[yellow]note:[/] {escape(f"{path}: {note}")}', highlight=False, soft_wrap=True
-        )
+        to.print(f'[yellow]note:[/] {escape(f"{path}: {note}")}', highlight=False, soft_wrap=True)
 
 
 def _write_report(folder: Path) -> Path:

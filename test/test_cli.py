@@ -110,8 +110,8 @@ def test_a_scan_in_millimetres_is_told_refused_and_converted(tmp_path):
     (tmp_path / 'scan.xyz').write_text('\n'.join([*rows, '']))
     said = run('map', 'info', 'scan.xyz', cwd=tmp_path)
     assert said.returncode == 0 and '500 points' in said.stdout
-    assert 'left aside: red, green, blue' in said.stderr
-    assert 'looks like millimetres' in said.stderr
+    assert 'left aside: red, green, blue' in said.stdout
+    assert 'looks like millimetres' in said.stdout
     refused = run('replay', 'no_bag', '--map', 'scan.xyz', cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr.startswith('error: scan.xyz: ') and '--scale 0.001' in refused.stderr
@@ -121,7 +121,7 @@ def test_a_scan_in_millimetres_is_told_refused_and_converted(tmp_path):
     assert np.abs(prior.points).max() == pytest.approx(1.0, abs=0.01)
     assert prior.sigma == 0.002 and prior.oriented
     said = run('map', 'info', 'map.npz', cwd=tmp_path)
-    assert 'sigma 2 mm' in said.stdout and 'millimetres' not in said.stderr
+    assert 'sigma 2 mm' in said.stdout and 'millimetres' not in said.stdout
 
 
 def test_names_with_markup_are_printed_as_they_are(tmp_path):
