@@ -7,6 +7,7 @@ Hall-effect Sensors and IMUs" (Hall).
 """
 
 from pathlib import Path
+from types import SimpleNamespace
 
 from continuum_loc.estimator.settings import EstimatorSettings, PRESETS_FOLDER, settings_of
 from continuum_loc.measurements import TrackedPose
@@ -178,6 +179,19 @@ def test_every_way_to_a_filter_takes_the_robots_settings():
     assert trial_settings(trial).tof.footprint == 0.0
     real = trial_settings(Trial('soft_arm', 'R1', 'b1', fidelity='vl53l5cx'))
     assert (real.tof.footprint, real.calibration_sigma) == (0.5, (0.003, 0.015))
+
+
+def test_the_live_node_takes_the_robots_settings_or_those_given(tmp_path):
+    pytest.importorskip('rclpy', reason='rclpy is not installed')
+    from continuum_loc.nodes.estimator import EstimatorNode
+
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text('knot_period: 0.07\n')
+    for chosen, period in (('', 0.2), (str(mine), 0.07)):
+        node = SimpleNamespace(
+            robot=load_robot('engine'), settings=SimpleNamespace(settings=chosen)
+        )
+        assert EstimatorNode._preset(node).knot_period == period
 
 
 def test_a_replay_takes_the_robots_settings_or_those_given(tmp_path):
