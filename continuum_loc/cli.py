@@ -246,7 +246,7 @@ def replay(
     from continuum_loc.offline.scene_maps import scene_map_file
     from continuum_loc.robot import load_robot
 
-    description, duration = load_robot(robot), _bag_duration(bag)
+    description = load_robot(robot)
     chosen = settings_of(description.name, settings)
     if description.tof and chosen.tof.enabled:
         _require_map(description.name, map_file, scene)
@@ -258,7 +258,7 @@ def replay(
         estimator = make_filter(description, prior, chosen)
     if prior is not None:
         _say(map_file, prior.notes)
-    with _bar('replaying', duration) as progress:
+    with _bar('replaying', _bag_duration(bag)) as progress:
         result = run_replay(
             bag,
             estimator,

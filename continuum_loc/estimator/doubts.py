@@ -58,7 +58,6 @@ class Doubts:
         self._told_at: dict[str, float] = {}
         self._since: dict[str, float] = {}
         self._round: Round | None = None
-        self.asked = False  # by whoever is about to accuse a clock
         self._gyro_names = [imu.name for imu in setup.robot.imu] if factors else []
         self._patrolled, self._next_patrol = 0, PATROL
         self._off = False  # the window does not fit, and no round of explanations has been yet
@@ -67,11 +66,6 @@ class Doubts:
         self._consumed = tuple(factor.consumes for factor in factors)
         self._candidates = explanations(setup.robot, {factor.name for factor in factors})
         self._seen: dict[str, tuple[float, bool]] = {}  # newest frame, and when a zone was usable
-
-    @property
-    def answered(self) -> bool:
-        """Whether a round of explanations ended without a finding not long ago."""
-        return self._backoff > 1.0
 
     def note(self, measurement: Measurement, time: float) -> None:
         """Keep a measurement for as long as it may be solved again."""
@@ -146,7 +140,7 @@ class Doubts:
     def _explain(self, time: float, epoch: int) -> None:
         """Go on with a round of explanations, or begin one where the window does not fit."""
         if self._round is None:
-            if time < self._next_round or not (self._uneasy(time) or self.asked):
+            if time < self._next_round or not self._uneasy(time):
                 self._patrol(time, epoch)
                 return
             self._round = Round.of(self._stretch(epoch), self._ordered())

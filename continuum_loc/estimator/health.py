@@ -45,8 +45,6 @@ class Health:
     ):
         self.reasons: dict[str, str] = {}
         self.told: dict[str, str] = {}  # causes that were found otherwise
-        # About to accuse a clock: is there another explanation? And whether that was looked for.
-        self.asks, self.answered = False, False
         self.waiting = False  # for an explanation, before which nobody is accused of not fitting
         self._robot, self._window, self._factors, self._settings = robot, window, factors, settings
         self._heard: dict[str, float] = {}
@@ -68,10 +66,8 @@ class Health:
         self._heard[sensor] = max(time, self._heard.get(sensor, time))
 
     def hear_of(self, doubts: Doubts) -> None:
-        """Take over what causes were found, and ask whether there are others."""
+        """Take over what causes were found, and whether more are looked for."""
         self.told, self.waiting = doubts.causes, doubts.pending
-        self.answered = doubts.answered
-        doubts.asked = self.asks
 
     def look(self, time: float, body_believed: bool, body_doubted: bool) -> None:
         """
@@ -82,9 +78,12 @@ class Health:
         the body off.
         """
         reasons = dict.fromkeys(self._noisy(), NOISY)
-        for name in self._misfits():
+        misfits = self._misfits()
+        # One alone is wrong itself; several may be pulled off by a sensor of another kind.
+        waiting = self.waiting and len(misfits) > 1
+        for name in misfits:
             known = name in self.disbelieved
-            if known or not self.waiting and (body_believed or name not in self._tof_names):
+            if known or not waiting and (body_believed or name not in self._tof_names):
                 reasons[name] = MISFIT
         if not (body_doubted or self.waiting or MISFIT in reasons.values()):
             self._look_at_clocks(time)
@@ -143,9 +142,7 @@ class Health:
         if np.max(evidence.spread, initial=0.0) <= MOST_SPREAD:
             self._clocks_known = time
             still = self._still_off(evidence)
-            new = self._newly_off(evidence, still)
-            self.asks = bool(new) and not self.answered
-            self._late = still if self.asks else still | new
+            self._late = still | self._newly_off(evidence, still)
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}  # a body that rattles says nothing of clocks
 
