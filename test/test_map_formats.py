@@ -625,7 +625,10 @@ def test_a_row_of_a_million_columns_is_refused():
 def test_a_file_larger_than_the_memory_is_refused_before_it_is_read(tmp_path):
     path = tmp_path / 'sparse.ply'
     with path.open('wb') as stream:
-        stream.truncate(10**13)  # a sparse file: no such space is taken
+        try:
+            stream.truncate(10**13)  # a sparse file: no such space is taken
+        except OSError:
+            stream.truncate(10**12)  # as much as a file system takes
     with pytest.raises(MapError, match=r'sparse\.ply: does not fit into memory'):
         load_map(path)
 

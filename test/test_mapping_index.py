@@ -295,4 +295,4 @@ def test_a_map_is_indexed_once_for_filter_scene_and_rehearsal(monkeypatch):
     warm_up(robot, prior, settings, scene)
     estimator = SlidingWindowFilter(robot, prior, settings)
     assert made.count(len(prior)) == 1
-    assert estimator.tof.index is prior.index
+    assert estimator.setup.surface.lookup is prior.index.arrays

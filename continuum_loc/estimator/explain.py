@@ -161,7 +161,7 @@ def explanations(robot: RobotDescription, used: set[str]) -> list[Explanation]:
             ('base',), 'is not where the description has it', AS_IS.change, base_freed=True
         )
     )
-    if 'gyro' in used:
+    if 'gyro' in used and robot.imu:
         found += [
             _without(ImuSample, imu.name, 'contradicts the rest', 'gyro') for imu in robot.imu
         ]
