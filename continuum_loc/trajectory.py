@@ -26,7 +26,7 @@ class Trajectory:
     T_map_ring: (K, R + 1, 4, 4).
     covariance: (K, R + 1, 6, 6) of a right perturbation, [rho; phi] order, or None (truth has
     none).
-    status: (K,) strings (`initialising`, `tracking`, `lost`), or None.
+    status: (K,) strings (see `Estimate`), or None.
     backbone: (K, B, 3) points of the backbone in `map` [m], base to tip, or None.
     """
 

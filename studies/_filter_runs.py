@@ -79,7 +79,8 @@ class CaseResult:
     times: (K,) s since the filter's first sample. status: (K,). found: errors. For every step of
     `steps` (S,) s,
     accused: names of the sensors that the filter suspects; shares: of samples that fit, by sensor
-    that it has heard.
+    that it has heard; reasons: why each is suspected, and under `status` why the estimate is
+    doubtful.
     """
 
     case: Case
@@ -91,6 +92,7 @@ class CaseResult:
     steps: np.ndarray = field(default_factory=lambda: np.empty(0))
     accused: list[list[str]] = field(default_factory=list)
     shares: list[dict[str, float]] = field(default_factory=list)
+    reasons: list[dict[str, str]] = field(default_factory=list)
 
     @property
     def worst_ring(self) -> np.ndarray:
@@ -128,6 +130,8 @@ class Witness:
                 {
                     'stamp': estimate.stamp,
                     'accused': list(estimate.suspects),
+                    'reasons': dict(estimate.suspects),
+                    'doubts': list(estimate.doubts),
                     'shares': dict(estimate.inliers),
                 }
             )
@@ -252,6 +256,10 @@ def load_case(out: Path, case: Case, error: str = '') -> CaseResult:
         np.array([(entry['stamp'] - epoch) / NANOSECONDS for entry in log]),
         [entry['accused'] for entry in log],
         [entry['shares'] for entry in log],
+        [
+            entry['reasons'] | ({'status': '; '.join(entry['doubts'])} if entry['doubts'] else {})
+            for entry in log
+        ],
     )
 
 

@@ -19,7 +19,6 @@ from continuum_loc.measurements import (
 )
 from continuum_loc.robot import load_robot
 from msg_tools.bag import BagWriter, read_bag
-from msg_tools.drivers import fbg_sample, ism330_sample, vl53l5cx_frame
 from msg_tools.factory import bag_messages, typestore
 from msg_tools.topics import topic_of, topic_spec
 import numpy as np
@@ -378,25 +377,8 @@ def _turns(degrees: float) -> Callable[[ImuSample], str]:
 
 def sample_of(line: bytes) -> TofFrame | ImuSample | StrainSample:
     """Make of a line what node `driver` makes of it."""
-    robot = load_robot('engine')
-    reading = _object(line)
-    stamp = round(float(reading.pop('stamp', 1.0)) * NANOSECONDS)
-    try:
-        if 'distance_mm' in reading:
-            return vl53l5cx_frame(robot.tof_model, stamp=stamp, **reading)
-        if 'gyro_raw' in reading:
-            scale = {'gyro_mdps_per_lsb': 17.5, 'accel_mg_per_lsb': 0.122}
-            return ism330_sample(stamp=stamp, **reading, **scale)
-        return fbg_sample(stamp, **reading, core_azimuth_deg=(0, 120, 240), core_radius=35e-6)
-    except TypeError as error:
-        raise MessageError('fields', str(error)) from None
+    from continuum_loc.nodes.support.readings import Readings
+    from continuum_loc.nodes.support.settings import DriverNodeSettings
 
-
-def _object(line: bytes) -> dict[str, Any]:
-    try:
-        reading = json.loads(line)
-    except ValueError as error:
-        raise MessageError('line', f'not JSON ({error})') from None
-    if not isinstance(reading, dict):
-        raise MessageError('line', f'a {type(reading).__name__}, not an object')
-    return reading
+    readings = Readings(load_robot('engine'), DriverNodeSettings(), lambda: NANOSECONDS)
+    return readings.sample(line)

@@ -32,7 +32,11 @@ from continuum_loc.robot import RobotDescription
 import numpy as np
 
 BASE_FREED = 1e3  # times its standard deviations
-GAIN = 0.12  # share of the cost that an explanation has to take away
+# Share of the cost that an explanation has to take away. Every real robot departs a little from
+# its description, and whatever is left out then makes the rest fit better.
+GAIN = 0.5
+# An encoder is one number, which the body absorbs: so little, if the base moves so far.
+ENCODER_GAIN, ENCODER_MOVE = 0.12, 0.01  # share, m
 RUNNER_UP = 2.0  # times as much as the next best
 DECISIVE = 0.6  # share of the cost beyond which no other explanation is asked for
 
@@ -44,7 +48,8 @@ class Explanation:
 
     sensors: whom it accuses; cause: in words. change: what a measurement would be, None where it
     would not be used. kind: the factor whose measurements it takes away, not to be counted on
-    either side. base_freed: the description's base is not believed.
+    either side. base_freed: the description's base is not believed. gain, move: what it has to
+    bring to be believed.
     """
 
     sensors: tuple[str, ...]
@@ -52,6 +57,8 @@ class Explanation:
     change: Callable[[Measurement], Measurement | None]
     kind: str = ''
     base_freed: bool = False
+    gain: float = GAIN
+    move: float = 0.0  # [m] that the base has to move by
 
 
 class Outcome(NamedTuple):
@@ -155,7 +162,8 @@ def explanations(robot: RobotDescription, used: set[str]) -> list[Explanation]:
     if 'tof' in used:
         found += _of_tof(robot)
     if 'insertion' in used and robot.base.insertion.mode == 'measured':
-        found.append(_without(EncoderSample, 'insertion', 'contradicts the rest', 'insertion'))
+        encoder = _without(EncoderSample, 'insertion', 'contradicts the rest', 'insertion')
+        found.append(replace(encoder, gain=ENCODER_GAIN, move=ENCODER_MOVE))
     found.append(
         Explanation(
             ('base',), 'is not where the description has it', AS_IS.change, base_freed=True
@@ -259,7 +267,7 @@ class Round:
     def verdict(self) -> Explanation | None:
         """Choose the explanation that clearly takes away most; None where there is none."""
         ranked = sorted(self.gains, key=_gain, reverse=True)
-        if not ranked or ranked[0][0] < GAIN:
+        if not ranked or not self._enough(*ranked[0]):
             return None
         best, explanation, _ = ranked[0]
         # Of one sensor or all of its kind, the one that does nearly as much is the better word.
@@ -272,6 +280,12 @@ class Round:
         if rivals and max(rivals) * RUNNER_UP > best:
             return None
         return explanation
+
+    def _enough(self, gain: float, explanation: Explanation, outcome: Outcome) -> bool:
+        """Whether an explanation brings what it has to."""
+        before, after = (one.window.column(-1).T[0, :3, 3] for one in (self.as_is, outcome))
+        moved = float(np.linalg.norm(after - before))
+        return gain >= explanation.gain and moved >= explanation.move
 
 
 def _gain(one: tuple[float, Explanation, Outcome]) -> float:

@@ -92,7 +92,7 @@ class EstimatorNode(WorkerNode):
         self.estimate = None
 
     def describe(self) -> tuple[int, str, dict[str, Any]]:
-        """Lost is an error; starting, suspects, what is not observed and so on are warnings."""
+        """Lost and doubtful are errors; starting, suspects, what nothing observes are warnings."""
         estimate = self.estimate
         if estimate is None:
             return WARN, 'no estimate yet', {}
@@ -116,19 +116,7 @@ class EstimatorNode(WorkerNode):
             else 'unknown',
             'rate [Hz]': _rate(self.recent),
         }
-        if estimate.status == 'lost':
-            return ERROR, 'lost', values
-        if estimate.status == 'initialising':
-            return WARN, 'initialising', values
-        if estimate.suspects:
-            return WARN, f'suspect: {suspects}', values
-        if sigma > POORLY_KNOWN:
-            return WARN, f'nothing observes {values["least known"]}', values
-        return (
-            (OK, 'tracking', values)
-            if estimate.converged
-            else (WARN, 'the last step did not converge', values)
-        )
+        return *_verdict(estimate, suspects, values['least known']), values
 
     def summary(self) -> dict[str, Any]:
         """Add the filter's own counts."""
@@ -137,7 +125,9 @@ class EstimatorNode(WorkerNode):
     # ------------------------------------------------ outputs
 
     def _publish(self, estimate: Estimate) -> None:
-        self.estimate = estimate
+        before, self.estimate = self.estimate, estimate
+        if estimate.doubts and (before is None or not before.doubts):
+            self.get_logger().warning(f'doubtful: {"; ".join(estimate.doubts)}')
         self.publish('poses', estimate)
         child = self.settings.frame_prefix + self.robot.ring_names[-1]
         self.publish_message('tip', tip_message(ros_messages(), tip_of(estimate), child))
@@ -281,6 +271,23 @@ def with_base(
         )
     base = type(robot.base).model_validate(robot.base.model_dump() | change)
     return type(robot).model_validate(robot.model_dump() | {'base': base.model_dump()})
+
+
+def _verdict(estimate: Estimate, suspects: str, least_known: str) -> tuple[int, str]:
+    """Say in a line what is the matter, the gravest first."""
+    if estimate.status == 'lost':
+        return ERROR, 'lost'
+    if estimate.status == 'initialising':
+        return WARN, 'initialising'
+    if estimate.status == 'doubtful':
+        return ERROR, f'doubtful: {"; ".join(estimate.doubts)}'
+    if estimate.suspects:
+        return WARN, f'suspect: {suspects}'
+    if estimate.least_known[1] > POORLY_KNOWN:
+        return WARN, f'nothing observes {least_known}'
+    if not estimate.converged:
+        return WARN, 'the last step did not converge'
+    return OK, 'tracking'
 
 
 def _answer(action: Any, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -135,7 +135,7 @@ def summary_of(result: ReplayResult) -> dict[str, Any]:
             'judged': len(associate(judged, result.truth)[0]),
             **{
                 name: int((status == name).sum()) if status is not None else 0
-                for name in ('initialising', 'tracking', 'lost')
+                for name in ('initialising', 'tracking', 'doubtful', 'lost')
             },
         },
         'consistency': float(np.median(result.consistency))

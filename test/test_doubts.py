@@ -1,0 +1,128 @@
+"""What contradicts the description is named, with its likely cause, and nobody else is blamed."""
+
+from dataclasses import replace
+
+from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
+from continuum_loc.estimator.readings import gyro_cause, strain_cause
+from continuum_loc.measurements import (
+    ImuSample,
+    TOF_NO_TARGET,
+    TofFrame,
+    TruthSample,
+)
+from continuum_loc.settings import parse_settings
+import numpy as np
+import pytest
+from worlds import Rod, rod, room_map, stream
+
+SIGMA = 0.01  # rad/s of a gyro, 1/m of a strain sensor
+SETTINGS = {'knot_period': 0.1, 'window': 0.6, 'lag': 0.2}
+
+
+def motion(seed=0, count=200):
+    """Draw a smooth angular velocity (K, 3) of some tenths of a radian per second."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 2.0, count)[:, None]
+    return 0.4 * np.sin(rng.uniform(2, 5, 3) * t + rng.uniform(0, 6, 3))
+
+
+def noise(shape, seed=1):
+    return SIGMA * np.random.default_rng(seed).normal(size=shape)
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        (lambda w: w * 57.29578, 'too fast: degrees'),
+        (lambda w: w / 57.29578, 'too slowly: converted to radians twice'),
+        (lambda w: w * [1, 1, -1], 'sign of axis z'),
+        (lambda w: w * [-1, 1, 1], 'sign of axis x'),
+        (lambda w: w[:, [0, 2, 1]], 'axes swapped? (x, z, y)'),
+        (lambda w: w[:, [1, 2, 0]], 'axes swapped? (z, x, y)'),
+    ],
+)
+def test_a_gyro_that_reads_otherwise_than_the_body_turns_is_told_why(change, said):
+    body = motion()
+    assert said in gyro_cause(body, change(body + noise(body.shape)), SIGMA, 0.02)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_a_healthy_gyro_is_told_nothing(seed):
+    """A bias of 0.015 rad/s and a mount 3 degrees off are what healthy ones have."""
+    body = motion(seed)
+    turn = np.radians(3.0) * np.random.default_rng(seed).normal(size=3) / np.sqrt(3)
+    read = body + np.cross(body, turn) + 0.015 + noise(body.shape, seed)
+    assert gyro_cause(body, read, SIGMA, 0.02) == ''
+
+
+def test_a_body_that_rattles_or_rests_tells_nothing_of_its_gyro():
+    """What shakes faster than the knots follow is no unit: the body explains none of it."""
+    body = 0.05 * motion()
+    rattle = 3.0 * np.random.default_rng(2).normal(size=body.shape)
+    assert gyro_cause(body, body + rattle, SIGMA, 0.02) == ''
+    assert gyro_cause(0.0 * body, noise(body.shape), SIGMA, 0.02) == ''
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        (lambda t, k: (t, k / 1000), '1/mm'),
+        (lambda t, k: (t, 1000 * k), '1000 times too large'),
+        (lambda t, k: (np.degrees(t), k), 'angle in degrees'),
+        (lambda t, k: (-t, k), 'angle of the other sign'),
+        (lambda t, k: (t, -k), 'curvature of the other sign'),
+        (lambda t, k: (t - np.pi / 2, k), '90 degrees too small'),
+    ],
+)
+def test_strain_in_another_unit_or_sign_is_told(change, said):
+    rng = np.random.default_rng(0)
+    theta, kappa = rng.uniform(0.3, 1.2, 60), rng.uniform(0.3, 0.9, 60)
+    body = np.column_stack([-kappa * np.sin(theta), kappa * np.cos(theta)])
+    assert said in strain_cause(body, *change(theta, kappa + noise(60)), SIGMA)
+    assert strain_cause(body, theta, kappa + noise(60), SIGMA) == ''
+
+
+def followed(change, seconds=3.0, seed=3, prior=True, description=None):
+    """Estimates of a moving rod whose measurements are `change`d."""
+    robot = description or rod()
+    settings = parse_settings(EstimatorSettings, SETTINGS)
+    estimator = SlidingWindowFilter(robot, room_map() if prior else None, settings)
+    made = []
+    for sample in stream(Rod(robot, seed=seed), seconds):
+        if not isinstance(sample, TruthSample):
+            made.append(estimator.process(change(sample)))
+    return [estimate for estimate in made if estimate is not None]
+
+
+def of_gyro(name, change):
+    def altered(sample):
+        if isinstance(sample, ImuSample) and sample.sensor == name:
+            return replace(sample, angular_velocity=change(sample.angular_velocity))
+        return sample
+
+    return altered
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_nobody_is_blamed_where_all_is_as_described(seed):
+    made = followed(lambda sample: sample, seed=seed)
+    assert all(not estimate.suspects and not estimate.doubts for estimate in made)
+    assert made[-1].status == 'tracking'
+
+
+def test_a_gyro_in_degrees_is_named_with_its_unit_and_alone():
+    made = followed(of_gyro('r1_imu', lambda w: w * 57.29578))
+    assert 'degrees' in made[-1].suspects['r1_imu']
+    assert set().union(*(estimate.suspects for estimate in made)) == {'r1_imu'}
+
+
+def test_without_a_usable_zone_or_without_a_map_the_estimate_is_doubtful():
+    def blind(sample):
+        if not isinstance(sample, TofFrame):
+            return sample
+        return replace(sample, status=np.full(len(sample.status), TOF_NO_TARGET, np.uint8))
+
+    last = followed(blind, 2.0)[-1]
+    assert last.status == 'doubtful' and any('no usable zone' in why for why in last.doubts)
+    last = followed(lambda sample: sample, 2.0, prior=False)[-1]
+    assert last.status == 'doubtful' and '7 ToF sensors are not used' in last.doubts[0]
