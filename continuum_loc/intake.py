@@ -358,7 +358,8 @@ class Intake:
                 self._report(
                     'restart',
                     f'time went {way}, from {before / NANOSECONDS:.3f} to '
-                    f'{stamp / NANOSECONDS:.3f} s: the data starts again, and so does the estimate',
+                    f'{stamp / NANOSECONDS:.3f} s: the data starts again, '
+                    'and so does the estimate',
                 )
             self.restart()
 
