@@ -354,10 +354,12 @@ class Intake:
             )
         if gate.restarts != restarts:
             if gate.restarts <= RESTARTS_TOLD:
+                way = 'backward' if stamp < before else 'forward'
                 self._report(
                     'restart',
-                    f'time went from {before / NANOSECONDS:.3f} to {stamp / NANOSECONDS:.3f} s: '
-                    'the data starts again, and so does the estimate',
+                    f'time went {way}, from {before / NANOSECONDS:.3f} to '
+                    f'{stamp / NANOSECONDS:.3f} s: the data starts again, '
+                    'and so does the estimate',
                 )
             self.restart()
 
