@@ -67,9 +67,10 @@ def _asked(prior: PriorMap, duration: float) -> list[Batch]:
     track = replay(samples, make_filter(robot, prior)).track
     frames = [sample for sample in samples if isinstance(sample, TofFrame)]
     placed = reconstruct(robot, frames, track)
-    directions = Beams.of(placed).directions[: len(placed.points)]
+    count = len(placed.points)
+    directions = Beams.of(placed).directions[:count]
     return [
-        (placed.points[first : first + BATCH], directions[first : first + BATCH])
+        (placed.points[first:][:BATCH], directions[first:][:BATCH])
         for first in range(0, len(directions), BATCH)
     ]
 

@@ -100,7 +100,11 @@ def _blocks(flight: Flight) -> Blocks:
 
     def around(grid: np.ndarray) -> np.ndarray:
         return np.stack(
-            [grid[:, 1 + i : SIDE - 1 + i, 1 + j : SIDE - 1 + j] for i, j in _NEIGHBOURS], axis=-1
+            [
+                grid[:, slice(1 + i, SIDE - 1 + i), slice(1 + j, SIDE - 1 + j)]
+                for i, j in _NEIGHBOURS
+            ],
+            axis=-1,
         )
 
     whole = good[:, inner, inner] & around(good).all(axis=-1)

@@ -251,6 +251,7 @@ def row(result: CaseResult, kind: Kind | None) -> dict[str, Any]:
     culprits = struck(kind) if kind else set()
     blamed = {name for reasons in result.reasons for name in reasons} - culprits - {'status'}
     after = named_after(result, kind, culprits) if kind else None
+    settled = len(result.times) // 4
     return {
         'case': result.case.name,
         'trajectory': result.case.trial.trajectory,
@@ -258,7 +259,7 @@ def row(result: CaseResult, kind: Kind | None) -> dict[str, Any]:
         'said': said(result, culprits),
         'blamed': ', '.join(sorted(blamed)) or '-',
         'silent [s]': longest_unannounced(result),
-        'worst [cm]': 100.0 * float(result.worst_ring[len(result.times) // 4 :].max()),
+        'worst [cm]': 100.0 * float(result.worst_ring[settled:].max()),
     }
 
 

@@ -108,15 +108,15 @@ def test_information_is_the_slope_of_the_gradient(kind):
     assert H.any() and np.linalg.eigvalsh(H)[0] > -1e-9 * np.abs(H).max()
     scale = np.sqrt(np.maximum(np.diagonal(H), 1e-12))
     assert np.abs(g / scale).max() < 1e-6  # in sigmas
-    rng = np.random.default_rng(0)
+    rng, dim = np.random.default_rng(0), GRID.dim
     for _ in range(4):
         x = rng.normal(size=2 * GRID.dim) / scale.max()
         ends = [
             normal_equations(
                 kind,
                 measured,
-                a.retract(sign * STEP * x[: GRID.dim]),
-                b.retract(sign * STEP * x[GRID.dim :]),
+                a.retract(sign * STEP * x[:dim]),
+                b.retract(sign * STEP * x[dim:]),
             )[1]
             for sign in (1.0, -1.0)
         ]

@@ -238,7 +238,8 @@ class SlidingWindowFilter:
         just begun.
         """
         k = self.window.knot_before(time)
-        variances = rattle(self.window.intervals[max(k - 1, 0) : k + 1])
+        recent = slice(max(k - 1, 0), k + 1)
+        variances = rattle(self.window.intervals[recent])
         s_imu = {name: self._s_imu[name] for name in self._s_imu if name in variances}
         turns = np.sqrt([variances[name] for name in s_imu]).reshape(-1, 3)
         return rattle_covariance(np.array(list(s_imu.values())), turns, s)

@@ -130,7 +130,8 @@ def _ahead(window: Window, time: float, n: int) -> Pair:
     P = window.chain.covariance(k, np.zeros((2 * m, window.grid.dim)), _rows_of(window, n))
     later, J = newest.predict(dt), np.eye(2 * m)
     for i in range(2):
-        twist, own = dt * newest.velocity[n + i], J[m * i : m * i + m, m * i : m * i + m]
+        mine = slice(m * i, m * i + m)
+        twist, own = dt * newest.velocity[n + i], J[mine, mine]
         own[POSE_PART, POSE_PART] = lie.adjoint(lie.exp(-twist))
         own[POSE_PART, VELOCITY_PART] = dt * lie.right_jacobian(twist)
     growth = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
@@ -171,10 +172,10 @@ def _along(grid: Grid, n: int, offset: float, pair: Pair, strain_psd: np.ndarray
     Pose and strain by the same Hermite in s, velocity linearly in the frames that the exact
     adjoint carries from the nearer node.
     """
-    ends, m = ends_along(pair.T, pair.strain, grid.s[n : n + 2], 0), NODE_DIM
+    ends, m = ends_along(pair.T, pair.strain, grid.s[n:][:2], 0), NODE_DIM
     at, u = gp.interpolate(ends, offset), offset / ends.span
     J = np.zeros((m, 2 * m))
-    J[:12, :12], J[:12, m : m + 12] = np.split(np.concatenate([at.J_pose, at.J_rate]), 2, axis=1)
+    J[:12, :12], J[:12, m:][:, :12] = np.split(np.concatenate([at.J_pose, at.J_rate]), 2, axis=1)
     carried = [
         weight * lie.adjoint(lie.inverse(at.T) @ T_node)
         for weight, T_node in zip((1.0 - u, u), pair.T, strict=True)

@@ -229,7 +229,7 @@ def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndar
     for row in range(3):
         for column in range(3):
             if (row, column) != (1, 1):
-                there = np.s_[:, row : row + rows, column : column + columns]
+                there = np.s_[:, slice(row, row + rows), slice(column, column + columns)]
                 brighter = signals[there] > best_signal
                 best_signal = np.where(brighter, signals[there], best_signal)
                 best_depth = np.where(brighter, depths[there], best_depth)

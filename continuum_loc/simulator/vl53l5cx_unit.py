@@ -73,7 +73,7 @@ class Units:
         if len(self.offset) == 1:
             return [self]
         return [
-            Units(*(getattr(self, f.name)[i : i + 1] for f in fields(self)))
+            Units(*(getattr(self, f.name)[i:][:1] for f in fields(self)))
             for i in range(len(self.offset))
         ]
 
