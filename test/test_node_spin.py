@@ -43,7 +43,7 @@ def test_a_turn_leaves_nothing_behind(node):
 
 def _functions() -> int:
     gc.collect()
-    return sum(isinstance(one, FunctionType) for one in gc.get_objects())
+    return sum(type(one) is FunctionType for one in gc.get_objects())
 
 
 @pytest.mark.timeout(60)

@@ -24,7 +24,6 @@ RECENT = 2  # intervals that say whether a ToF sensor fits now
 CERTAIN = 2.0  # times the deviations asked for, and one test will do
 MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
 KNOWN_FOR = 1.0  # [s] that what was found of the clocks holds without another test
-FIRST_CLOCKS = 1.0  # [s] of data: before, the body still finds its place
 STILL_SIGMAS = 3.0  # for a clock known to be off
 NOISY, MISFIT = 'noisy', 'does not fit'
 
@@ -54,7 +53,7 @@ class Health:
         self._clock_groups = self._groups()
         self._votes: dict[tuple[str, ...], int] = {}
         self._late: dict[tuple[str, ...], ClockOffset] = {}
-        self._next_clocks, self._clocks_known = FIRST_CLOCKS, 0.0
+        self._next_clocks, self._clocks_known = settings.clock_start, 0.0
 
     @property
     def disbelieved(self) -> set[str]:

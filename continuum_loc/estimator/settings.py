@@ -264,6 +264,11 @@ class HealthSettings(Settings):
     clock_sigmas: float = Field(
         5.0, gt=0.0, description='how many standard deviations it must be from none'
     )
+    clock_start: float = Field(
+        1.0,
+        ge=0.0,
+        description='data before the first test of the clocks: the body still finds its place [s]',
+    )
     clock_period: float = Field(
         0.4, ge=0.0, description='time between two tests of the clocks; 0 switches them off [s]'
     )

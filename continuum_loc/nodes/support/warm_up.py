@@ -64,6 +64,8 @@ def hurried(settings: EstimatorSettings) -> EstimatorSettings:
     return settings.model_copy(
         update={
             'recovery': settings.recovery.model_copy(update=recovery),
+            'health': settings.health.model_copy(update={'clock_start': 0.0}),
+            'doubts': settings.doubts.model_copy(update={'enabled': False}),
             'solver': settings.solver.model_copy(
                 update={'max_iterations': 2, 'acquisition_iterations': 2}
             ),
