@@ -8,12 +8,14 @@ from continuum_loc.measurements import (
     ImuSample,
     TOF_NO_TARGET,
     TofFrame,
+    TrackedPose,
     TruthSample,
 )
+from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 import numpy as np
 import pytest
-from worlds import Rod, rod, room_map, stream
+from worlds import EPOCH, Rod, rod, room_map, stream
 
 SIGMA = 0.01  # rad/s of a gyro, 1/m of a strain sensor
 SETTINGS = {'knot_period': 0.1, 'window': 0.6, 'lag': 0.2}
@@ -126,3 +128,23 @@ def test_without_a_usable_zone_or_without_a_map_the_estimate_is_doubtful():
     assert last.status == 'doubtful' and any('no usable zone' in why for why in last.doubts)
     last = followed(lambda sample: sample, 2.0, prior=False)[-1]
     assert last.status == 'doubtful' and '7 ToF sensors are not used' in last.doubts[0]
+
+
+@pytest.mark.parametrize('shift', [(0.3, 0.0, 0.0), (1.0, 1.0, 0.0)])
+def test_trackers_that_contradict_the_base_are_not_tracking(shift):
+    """Two trackers see a rod whose base is elsewhere: the loss takes them for outliers."""
+    data = rod(tof=False, strain=False).model_dump()
+    data['imu'] = []
+    data['trackers'] = [{'name': f't{r}', 'ring': f'r{r}'} for r in (1, 2)]
+    robot = parse_settings(RobotDescription, data)
+    estimator = SlidingWindowFilter(robot, None, parse_settings(EstimatorSettings, SETTINGS))
+    truth, T_shift = Rod(robot, seed=1), np.eye(4)
+    T_shift[:3, 3] = shift
+    made = []
+    for k in range(120):
+        poses = T_shift @ truth.rings(k / 40.0)
+        for ring in (1, 2):
+            pose = TrackedPose(EPOCH + k * 25_000_000, f't{ring}', poses[ring])
+            made.append(estimator.process(pose))
+    last = [estimate for estimate in made if estimate is not None][-1]
+    assert last.status == 'doubtful' and last.doubts

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from continuum_loc.estimator.explain import Explanation, explanations, Round, Stretch
 from continuum_loc.estimator.factors import Factor, Setup
-from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor
+from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, share_by_factor
 from continuum_loc.estimator.interpolation import interpolated
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.readings import gyro_cause, strain_cause
@@ -36,6 +36,7 @@ BACKOFF_LIMIT = 16.0  # [s] longest time between two rounds without a finding
 ENOUGH = 0.4  # [s] of data before anything is said
 # [s] between two gyros that are judged apart, at first and later, and how often at first
 PATROL, SELDOM, FIRST_PATROLS = 0.4, 20.0, 3
+MOST = 0.7  # of a kind's samples have to fit, whatever else does
 LOW_SHARE = 0.6  # of a sensor's fitting samples: somebody is wrong
 BLIND = 'no usable zone'
 
@@ -240,6 +241,9 @@ class Doubts:
             reasons.append(
                 f'measurements are {np.sqrt(misfit):.1f} standard deviations off on average'
             )
+        for name, share in share_by_factor(self._window.intervals).items():
+            if self._lasts(f'{name} misfit', name != 'gyro' and share < MOST, time, 0.5):
+                reasons.append(f'only {100 * share:.0f} % of the {name} samples fit')
         if self._lasts('blind', self._blind(), time, 0.5):
             reasons.append(f'{BLIND} in any ToF frame')
         reasons += [
@@ -289,7 +293,7 @@ class Doubts:
         while self._recent and seconds(self._recent[0].stamp, epoch) < first:
             self._recent.popleft()
         for name, told in list(self._told_at.items()):
-            if name in ('base', 'insertion') and time - told > BACKOFF_LIMIT:
+            if time - told > BACKOFF_LIMIT:  # what is still so will be found again
                 self.causes.pop(name, None)
 
 

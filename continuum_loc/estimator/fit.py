@@ -42,6 +42,16 @@ def misfit_by_factor(intervals: Sequence[Interval]) -> dict[str, float]:
     return {name: float(squared / max(count, 1)) for name, (squared, count) in sums.items()}
 
 
+def share_by_factor(intervals: Sequence[Interval]) -> dict[str, float]:
+    """Share of fitting samples, of those factors that tell it and had any."""
+    sums: dict[str, np.ndarray] = {}
+    for interval in intervals:
+        for factor, report in interval.reports.items():
+            if report.fits is not None and len(report.fits):
+                sums[factor.name] = sums.get(factor.name, 0.0) + report.fits.sum(axis=0)
+    return {name: float(fit / usable) for name, (usable, fit) in sums.items() if usable}
+
+
 def consistency(intervals: Sequence[Interval], without: str = '') -> float:
     """Mean squared normalised residual of all factors but one; 1 where the noise is as stated."""
     squared, count = 0.0, 0
