@@ -3,7 +3,12 @@
 from dataclasses import replace
 
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
-from continuum_loc.estimator.readings import gyro_cause, strain_cause
+from continuum_loc.estimator.readings import (
+    gyro_cause,
+    range_cause,
+    strain_cause,
+    travel_cause,
+)
 from continuum_loc.measurements import (
     ImuSample,
     TOF_NO_TARGET,
@@ -148,3 +153,19 @@ def test_trackers_that_contradict_the_base_are_not_tracking(shift):
             made.append(estimator.process(pose))
     last = [estimate for estimate in made if estimate is not None][-1]
     assert last.status == 'doubtful' and last.doubts
+
+
+def test_an_encoder_beyond_its_range_is_told_with_the_likely_unit():
+    limits = (0.0, 0.6)
+    assert travel_cause(0.61, limits) == '' == travel_cause(-0.01, limits)
+    assert travel_cause(250.0, limits).endswith('millimetres?')
+    assert travel_cause(25.0, limits).endswith('centimetres?')
+    assert travel_cause(1.3, limits) == 'reads 1.3 m, beyond its range of 0 to 0.6 m'
+    assert travel_cause(-5e4, limits).endswith('0.6 m')
+
+
+def test_ranges_in_millimetres_are_told():
+    ranges = np.append(np.linspace(0.3, 2.0, 60), [np.inf] * 4)
+    assert range_cause(ranges, 4.0) == ''
+    assert range_cause(1e3 * ranges, 4.0).endswith('reach: millimetres?')
+    assert range_cause(np.full(64, np.inf), 4.0) == ''

@@ -17,7 +17,7 @@ from continuum_loc.estimator.factors import Factor, Setup
 from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, share_by_factor
 from continuum_loc.estimator.interpolation import interpolated
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.readings import gyro_cause, strain_cause
+from continuum_loc.estimator.readings import gyro_cause, range_cause, strain_cause, travel_cause
 from continuum_loc.estimator.settings import DoubtSettings
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
@@ -26,6 +26,7 @@ from continuum_loc.measurements import (
     Measurement,
     seconds,
     StrainSample,
+    TofFrame,
 )
 from continuum_loc.plausible import gyro_noise
 import numpy as np
@@ -68,10 +69,25 @@ class Doubts:
         self._candidates = explanations(setup.robot, {factor.name for factor in factors})
         self._seen: dict[str, tuple[float, bool]] = {}  # newest frame, and when a zone was usable
 
-    def note(self, measurement: Measurement, time: float) -> None:
-        """Keep a measurement for as long as it may be solved again."""
-        if isinstance(measurement, self._consumed):
+    def note(self, measurement: Measurement, time: float, used: bool) -> None:
+        """Keep a measurement that was used for as long as it may be solved again."""
+        if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
+        self._read_at_once(measurement, time)
+
+    def _read_at_once(self, measurement: Measurement, time: float) -> None:
+        """Judge what one measurement alone shows to be in another unit."""
+        robot = self._setup.robot
+        if isinstance(measurement, TofFrame):
+            cause = range_cause(measurement.ranges, robot.tof_model.max_range)
+            if cause:
+                self._tell((measurement.sensor,), cause, time)
+        if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
+            insertion = robot.base.insertion
+            travel = float(measurement.position[measurement.names.index('insertion')])
+            cause = travel_cause(travel, insertion.range)
+            if cause and insertion.mode == 'measured' and np.isfinite(travel):
+                self._tell(('insertion',), cause, time)
 
     @property
     def pending(self) -> bool:

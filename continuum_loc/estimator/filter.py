@@ -149,8 +149,8 @@ class SlidingWindowFilter:
             self.newest = max(self.newest, measurement.stamp)
             self._awaited.discard(type(measurement))
             self._rest.note(measurement)
-            self.doubts.note(measurement, time)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
+        self.doubts.note(measurement, time, any(used))
         return any(used)
 
     def _consumers(self, kind: type) -> list[Factor]:

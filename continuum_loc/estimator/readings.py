@@ -13,6 +13,9 @@ from itertools import permutations, product
 import numpy as np
 
 DEGREES = 180.0 / np.pi
+TRAVEL_SLACK = 0.02  # [m] that an encoder may read beyond the described range
+LENGTHS = {'millimetres': 1e-3, 'centimetres': 1e-2}
+BEYOND = 10.0  # times its reach: no sensor is that far off
 BETTER = 4.0  # times: how much smaller the squares have to be with a cause than without
 MISFIT = 4.0  # squared error of a reading over its noise's from which a cause is looked for
 EXPLAINED = 0.7  # share of what is read that a cause has to account for
@@ -38,6 +41,26 @@ def gyro_cause(body: np.ndarray, read: np.ndarray, sigma: float, bias: float) ->
         if _explained(read, body @ np.linalg.inv(M).T) > EXPLAINED
     }
     return _clear(left, as_read, count)
+
+
+def travel_cause(travel: float, limits: tuple[float, float]) -> str:
+    """Say that an encoder reads what its base cannot travel [m], or ''."""
+    least, most = limits[0] - TRAVEL_SLACK, limits[1] + TRAVEL_SLACK
+    if least <= travel <= most:
+        return ''
+    # In another unit it would lie well within the range, not next to zero.
+    likely = {name: 0.05 * most < size * travel <= most for name, size in LENGTHS.items()}
+    unit = next((name for name, fits in likely.items() if fits), '')
+    said = f'reads {travel:.4g} m, beyond its range of {limits[0]:g} to {limits[1]:g} m'
+    return f'{said}: {unit}?' if unit else said
+
+
+def range_cause(ranges: np.ndarray, max_range: float) -> str:
+    """Say that a ToF sensor reads (Z,) [m] what it cannot see, or ''."""
+    read = ranges[np.isfinite(ranges)]
+    if len(read) < 10 or np.median(read) < BEYOND * max_range:
+        return ''
+    return f'reads {np.median(read):.4g} m where {max_range:g} m is its reach: millimetres?'
 
 
 def strain_cause(body: np.ndarray, theta: np.ndarray, kappa: np.ndarray, sigma: float) -> str:

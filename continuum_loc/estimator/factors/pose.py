@@ -14,6 +14,7 @@ from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
 from continuum_loc.estimator.normal import gather, new_normal, scatter
+from continuum_loc.estimator.readings import travel_cause
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import EncoderSample, TrackedPose
 import numpy as np
@@ -131,6 +132,8 @@ class InsertionFactor(_PoseFactor):
             )
         travel = float(measurement.position[measurement.names.index('insertion')])
         require_finite(np.array(travel), 'insertion', 'joint_states')
+        if beyond := travel_cause(travel, insertion.range):
+            raise MeasurementError('beyond range', f"joint 'insertion' {beyond}")
         T_map_base = self.robot.base.T_map_base.copy()
         T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
