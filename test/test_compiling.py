@@ -71,7 +71,9 @@ def write(folder, inner=INNER, outer=OUTER):
 
 def environment(folder, **more):
     root = Path(continuum_loc.__file__).parents[1]
-    return {'PATH': '/usr/bin:/bin', 'HOME': str(folder), 'PYTHONPATH': f'{folder}:{root}', **more}
+    # Python takes a file changed within the same second to the same length for what it was.
+    own = {'PYTHONDONTWRITEBYTECODE': '1', 'PYTHONPATH': f'{folder}:{root}'}
+    return {'PATH': '/usr/bin:/bin', 'HOME': str(folder), **own, **more}
 
 
 def run(folder, **more):
