@@ -36,7 +36,8 @@ LASTING = 5.0  # [s] that a cause is told without being found again
 BACKOFF_LIMIT = 16.0  # [s] longest time between two rounds without a finding
 ENOUGH = 0.4  # [s] of data before anything is said
 # [s] between two gyros that are judged apart, at first and later, and how often at first
-PATROL, SELDOM, FIRST_PATROLS = 0.4, 20.0, 3
+PATROL, SELDOM, FIRST_PATROLS = 1.0, 20.0, 2
+PATROLLED = 3  # intervals that are solved again for it
 MOST = 0.7  # of a kind's samples have to fit, whatever else does
 LOW_SHARE = 0.6  # of a sensor's fitting samples: somebody is wrong
 BLIND = 'no usable zone'
@@ -185,7 +186,7 @@ class Doubts:
         rounds = self._patrolled // len(self._gyro_names)
         self._next_patrol = time + (PATROL if rounds < FIRST_PATROLS else SELDOM)
         explanation = next(one for one in self._candidates if one.sensors == (name,))
-        outcome = self._stretch(epoch).solve(explanation)
+        outcome = self._stretch(epoch, PATROLLED).solve(explanation, near=True)
         if outcome is not None:
             self._judge_gyro(name, outcome.window, time, epoch)
 
@@ -220,9 +221,9 @@ class Doubts:
         gyros = {imu.name for imu in robot.imu if imu.ring in rings}
         return sorted(self._candidates, key=lambda one: not set(one.sensors) <= gyros)
 
-    def _stretch(self, epoch: int) -> Stretch:
+    def _stretch(self, epoch: int, newest: int = NEWEST) -> Stretch:
         believed = [one for one in self._recent if _source(one) not in self.causes]
-        return Stretch(self._setup, self._window, epoch, believed, NEWEST)
+        return Stretch(self._setup, self._window, epoch, believed, newest)
 
     def _uneasy(self, time: float) -> bool:
         """Whether the window has not fitted for some time, whoever is to blame."""
