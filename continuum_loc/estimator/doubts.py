@@ -38,6 +38,7 @@ ENOUGH = 0.4  # [s] of data before anything is said
 # [s] between two gyros that are judged apart, at first and later, and how often at first
 PATROL, SELDOM, FIRST_PATROLS = 1.0, 20.0, 2
 PATROLLED = 3  # intervals that are solved again for it
+BADLY = 1.5  # times what makes all doubtful: one factor alone may be off by more
 MOST = 0.7  # of a kind's samples have to fit, whatever else does
 LOW_SHARE = 0.6  # of a sensor's fitting samples: somebody is wrong
 BLIND = 'no usable zone'
@@ -237,7 +238,7 @@ class Doubts:
         ]
         off = (
             self._misfit(newest) > self._settings.uneasy
-            or max(misfits, default=0.0) > self._settings.consistency
+            or max(misfits, default=0.0) > BADLY * self._settings.consistency
             or min(known, default=1.0) < LOW_SHARE
         )
         self._off = off

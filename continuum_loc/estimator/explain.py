@@ -38,6 +38,7 @@ GAIN = 0.5
 # An encoder is one number, which the body absorbs: so little, if the base moves so far.
 ENCODER_GAIN, ENCODER_MOVE = 0.12, 0.01  # share, m
 RUNNER_UP = 2.0  # times as much as the next best
+MOST_ITERATIONS = 12  # of a trial: what has not come by then is no explanation
 DECISIVE = 0.6  # share of the cost beyond which no other explanation is asked for
 
 
@@ -84,6 +85,10 @@ class Stretch:
         newest: int,
     ):
         self._setup, self._epoch = setup, epoch
+        solver = setup.settings.solver
+        least = min(MOST_ITERATIONS, solver.acquisition_iterations)
+        hurried = solver.model_copy(update={'acquisition_iterations': least})
+        self._hurried = setup.settings.model_copy(update={'solver': hurried})
         count = len(window.columns)
         self._columns = [window.column(k) for k in range(max(count - newest - 1, 0), count)]
         first, last = self._columns[0].time, self._columns[-1].time
@@ -100,7 +105,7 @@ class Stretch:
         setup, columns = self._setup, self._columns
         robot = base_freed(setup.robot) if explanation.base_freed else setup.robot
         priors = Priors(robot, setup.grid, setup.settings)
-        window = Window(setup.grid, priors, setup.settings)
+        window = Window(setup.grid, priors, self._hurried)
         window.start(columns[0])
         factors = [kind(setup) for kind in FACTORS if kind.wanted(setup)]
         for measurement in self._measurements:
