@@ -36,7 +36,7 @@ LASTING = 5.0  # [s] that a cause is told without being found again
 BACKOFF_LIMIT = 16.0  # [s] longest time between two rounds without a finding
 ENOUGH = 0.4  # [s] of data before anything is said
 # [s] between two gyros that are judged apart, at first and later, and how often at first
-PATROL, SELDOM, FIRST_PATROLS = 1.0, 20.0, 2
+PATROL, SELDOM, FIRST_PATROLS = 1.0, 20.0, 1
 PATROLLED = 3  # intervals that are solved again for it
 BADLY = 1.5  # times what makes all doubtful: one factor alone may be off by more
 MOST = 0.7  # of a kind's samples have to fit, whatever else does
