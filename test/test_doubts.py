@@ -89,10 +89,10 @@ def test_strain_in_another_unit_or_sign_is_told(change, said):
     assert strain_cause(body, theta, kappa + noise(60), SIGMA) == ''
 
 
-def followed(change, seconds=3.0, seed=3, prior=True, description=None):
+def followed(change, seconds=3.0, seed=3, prior=True, description=None, **changed):
     """Estimates of a moving rod whose measurements are `change`d."""
     robot = description or rod()
-    settings = parse_settings(EstimatorSettings, SETTINGS)
+    settings = parse_settings(EstimatorSettings, SETTINGS | changed)
     estimator = SlidingWindowFilter(robot, room_map() if prior else None, settings)
     made = []
     for sample in stream(Rod(robot, seed=seed), seconds):
@@ -121,6 +121,13 @@ def test_a_gyro_in_degrees_is_named_with_its_unit_and_alone():
     made = followed(of_gyro('r1_imu', lambda w: w * 57.29578))
     assert 'degrees' in made[-1].suspects['r1_imu']
     assert set().union(*(estimate.suspects for estimate in made)) == {'r1_imu'}
+
+
+def test_a_filter_without_gyros_asks_nothing_of_them():
+    """The gyros are looked at one by one from 1 s on, and these do not take part."""
+    made = followed(of_gyro('r1_imu', lambda w: w * 57.29578), 2.0, gyro={'enabled': False})
+    assert made[-1].status == 'tracking'
+    assert all('r1_imu' not in estimate.suspects for estimate in made)
 
 
 def test_without_a_usable_zone_or_without_a_map_the_estimate_is_doubtful():

@@ -62,17 +62,19 @@ class Doubts:
         self._told_at: dict[str, float] = {}
         self._since: dict[str, float] = {}
         self._round: Round | None = None
-        self._gyro_names = [imu.name for imu in setup.robot.imu] if factors else []
+        named = {factor.name for factor in factors}
+        self._gyro_names = [imu.name for imu in setup.robot.imu if 'gyro' in named]
         self._patrolled, self._next_patrol = 0, PATROL
         self._off = False  # the window does not fit, and no round of explanations has been yet
         self._next_round, self._backoff, self._next_reading = 0.0, 1.0, 0.0
-        self._unused = self._is_unused(setup, factors)
+        self._unused = self._is_unused(setup)
         self._consumed = tuple(factor.consumes for factor in factors)
-        self._candidates = explanations(setup.robot, {factor.name for factor in factors})
-        self._seen: dict[str, tuple[float, bool]] = {}  # newest frame, and when a zone was usable
+        self._candidates = explanations(setup.robot, named)
 
     def note(self, measurement: Measurement, time: float, used: bool) -> None:
         """Keep a measurement that was used for as long as it may be solved again."""
+        if not self._settings.enabled:
+            return
         if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
         self._read_at_once(measurement, time)
@@ -284,7 +286,7 @@ class Doubts:
         return bool(usable) and sum(usable) == 0.0
 
     @staticmethod
-    def _is_unused(setup: Setup, factors: Sequence[Factor]) -> str:
+    def _is_unused(setup: Setup) -> str:
         robot = setup.robot
         if robot.tof and setup.settings.tof.enabled and setup.prior_map is None:
             return f'no prior map: {len(robot.tof)} ToF sensors are not used'
