@@ -17,7 +17,7 @@ from typing import NamedTuple
 from continuum_loc.errors import MeasurementError, SingularError
 from continuum_loc.estimator.factors import FACTORS, Setup
 from continuum_loc.estimator.priors import Priors
-from continuum_loc.estimator.solver import acquire, track
+from continuum_loc.estimator.solver import from_a_guess, track
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
     EncoderSample,
@@ -144,22 +144,6 @@ def base_freed(robot: RobotDescription) -> RobotDescription:
         'sigma_rotation_deg': min(BASE_FREED * base.sigma_rotation_deg, 90.0),
     }
     return robot.model_copy(update={'base': base.model_copy(update=loose)})
-
-
-def from_a_guess(window: Window, factors: Sequence) -> tuple[int, bool]:
-    """Solve a window from a guess, matching widely at first: (iterations, whether converged)."""
-
-    def loosen(iteration: int) -> bool:
-        moved = [factor.loosen(iteration) for factor in factors]
-        if any(moved):
-            window.mark_changed()
-        return all(factor.tight for factor in factors)
-
-    try:
-        return acquire(window, loosen)
-    finally:
-        for factor in factors:
-            factor.loosen(0)
 
 
 AS_IS = Explanation((), '', lambda measurement: measurement)

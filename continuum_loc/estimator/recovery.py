@@ -17,7 +17,7 @@ from continuum_loc.estimator.fit import fit_of, measurement_cost, newest_fits
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.search import ShapeSearch, Snapshot
 from continuum_loc.estimator.settings import RecoverySettings
-from continuum_loc.estimator.solver import acquire, track
+from continuum_loc.estimator.solver import from_a_guess, track
 from continuum_loc.estimator.state import Column, column_at_rest
 from continuum_loc.estimator.window import Window
 from continuum_loc.robot import RobotDescription
@@ -111,17 +111,7 @@ class Recovery:
 
     def acquire(self) -> tuple[int, bool]:
         """Solve the window from a guess, matching widely: (iterations, whether it converged)."""
-        try:
-            return acquire(self._window, self._loosen)
-        finally:
-            self._loosen(0)
-
-    def _loosen(self, iteration: int) -> bool:
-        """Match as widely as befits an iteration from a guess; True once as while tracking."""
-        moved = [factor.loosen(iteration) for factor in self._factors]
-        if any(moved):
-            self._window.mark_changed()
-        return all(factor.tight for factor in self._factors)
+        return from_a_guess(self._window, self._factors)
 
     def look_after(self, time: float, converged: bool) -> None:
         """Notice a wrong minimum by the worst ring's fitting share, and look for a better body."""

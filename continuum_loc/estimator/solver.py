@@ -8,9 +8,10 @@ elimination up to the first that changed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from continuum_loc.errors import SingularError
+from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interpolation import blended_step
 from continuum_loc.estimator.state import Column, NODE_DIM, POSE_PART
 from continuum_loc.estimator.window import Window
@@ -74,6 +75,23 @@ def acquire(window: Window, narrow: Callable[[int], bool]) -> tuple[int, bool]:
     _linearise(window)
     _solve(window, 0, 0.0)  # the covariance must not know of the damping
     return iteration, iteration < limit and damping <= DAMPING_LIMIT
+
+
+def from_a_guess(window: Window, factors: Sequence[Factor]) -> tuple[int, bool]:
+    """Solve a window from a guess, matching widely at first: (iterations, whether converged)."""
+
+    def loosen(iteration: int) -> bool:
+        """Match as widely as befits an iteration; True once as while tracking."""
+        moved = [factor.loosen(iteration) for factor in factors]
+        if any(moved):
+            window.mark_changed()
+        return all(factor.tight for factor in factors)
+
+    try:
+        return acquire(window, loosen)
+    finally:
+        for factor in factors:
+            factor.loosen(0)
 
 
 def _solve(window: Window, first: int, damping: float) -> list[np.ndarray]:
