@@ -184,7 +184,7 @@ class MechanicsSettings(Settings):
     enabled: bool = True
     scale: float = Field(1.0, gt=0.0, description="factor on the block's `strain_sigma`")
     memory: float = Field(
-        1.0, gt=0.0, description='time over which all samples count as one observation [s]'
+        0.3, gt=0.0, description='time over which all samples count as one observation [s]'
     )
     period: float = Field(
         0.05, ge=0.0, description='least time between two samples that are used [s]'

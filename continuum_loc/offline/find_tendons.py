@@ -1,9 +1,9 @@
 """
 Which motor is which tendon: its end, sign and angle, from stretches in which it stands out.
 
-Each motor is fitted by itself at every end and with either sign; the others hang or hold, so that
-what they do is bending at rest. The ends are settled together afterwards: one motor after another
-is tried at the others, over the whole recording.
+Each motor is fitted by itself at every end; the others hang or hold, so that what they do is
+bending at rest. The ends are shared out evenly at the least cost first, and settled together
+afterwards: one motor after another is tried at the others, over the whole recording.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from dataclasses import replace
 
 from continuum_loc.actuation import Actuation, BodyFriction, Tendon
 from continuum_loc.errors import CalibrationError
-from continuum_loc.offline.identify import Identification
+from continuum_loc.offline.identify import Identification, MARKER_NOISE
 from continuum_loc.offline.motor_csv import Recording
 from continuum_loc.robot import RobotDescription
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 OUT = 2e-3  # [m]
 STILL, MOVING = 5e-5, 1e-4  # [m] from row to row
@@ -25,7 +26,7 @@ LEAST_TRAVEL = 1e-3  # [m] of a motor alone that tells of its tendon
 LEAST_ROWS = 5
 STIFF = 10.0  # of a tendon, against the bending of the first stretch seen from it
 FRICTION = BodyFriction(share=0.3, bend=1.0)
-ALONE_ITERATIONS, TOGETHER_ITERATIONS, TRIAL_ITERATIONS = 8, 10, 3
+ALONE_ITERATIONS, TOGETHER_ITERATIONS, TRIAL_ITERATIONS = 12, 15, 3
 ROWS = 250  # of a recording, to settle the ends by
 
 
@@ -33,19 +34,25 @@ def alone(recording: Recording, motor: int) -> np.ndarray:
     """
     Rows (K,) of the longest way that a motor went alone; empty without.
 
-    Alone is a motor that moves while all others hold, or that is farther out than any other by
-    OUT, as when it is pulled while the others are let out.
+    Alone is a motor that moves while all others hold; failing that, one that moves while it is
+    farther out than any other by OUT, as when it is pulled and the others are let out.
     """
     own, others = recording.moved[:, motor], np.delete(recording.moved, motor, axis=1)
+    moves = np.abs(np.diff(own)) > MOVING
     held = np.abs(np.diff(others, axis=0)).max(axis=1, initial=0.0) < STILL
-    single = np.concatenate([[False], held & (np.abs(np.diff(own)) > MOVING)])
-    single[:-1] |= single[1:]
-    single |= (own > others.max(axis=1) + OUT) | (own < others.min(axis=1) - OUT)
+    out = (own > others.max(axis=1) + OUT) | (own < others.min(axis=1) - OUT)
+    rows = _longest(own, moves & held)
+    return rows if len(rows) else _longest(own, moves & out[1:] & out[:-1])
+
+
+def _longest(own: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Rows (K,) of the longest way of a motor (S,) in a run of `steps` (S - 1,)."""
     best, travel = np.empty(0, int), LEAST_TRAVEL
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], single.astype(int), [0]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], steps.astype(int), [0]])))
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first >= LEAST_ROWS and np.ptp(own[first:last]) > travel:
-            best, travel = np.arange(first, last), float(np.ptp(own[first:last]))
+        rows = np.arange(first, last + 1)
+        if len(rows) >= LEAST_ROWS and np.ptp(own[rows]) > travel:
+            best, travel = rows, float(np.ptp(own[rows]))
     return best
 
 
@@ -77,13 +84,15 @@ def find_tendons(
             f'motors that never moved alone by {1e3 * LEAST_TRAVEL:g} mm: {", ".join(silent)}; '
             'record each of them pulled alone while the others hang'
         )
-    tendons = tuple(
-        _find_one(robot, _rows(recording, mine, (k,)), ends, arm, EI)
+    found = [
+        _candidates(robot, _rows(recording, mine, (k,)), ends, arm, EI)
         for k, mine in enumerate(rows)
         if not broken(recording, k, robot.length, arm)
-    )
-    if not tendons:
+    ]
+    if not found:
         raise CalibrationError('no motor moves the tip: is it the tip of this robot?')
+    chosen = _shared_out(np.array([costs for _, costs in found]))
+    tendons = tuple(one[end] for (one, _), end in zip(found, chosen, strict=True))
     return settle(_with(robot, tendons, EI, arm), thinned(recording), ends)
 
 
@@ -99,32 +108,49 @@ def _rows(recording: Recording, rows: np.ndarray, motors: tuple[int, ...] = ()) 
     )
 
 
-def _find_one(
-    robot: RobotDescription, recording: Recording, ends: Sequence[float], arm: float, EI: float
-) -> Tendon:
-    """Fit one motor alone at every end and with both signs; the best."""
-    best, least = None, np.inf
-    for sign in (1, -1):
-        pulled = sign * recording.moved[:, 0]
-        far = recording.tip[np.argmax(pulled)] - recording.tip[np.argsort(pulled)[:3]].mean(axis=0)
-        _, y, z = robot.base.T_map_base[:3, :3].T @ far
-        for end in ends:
-            tendon = Tendon(
-                name=recording.motors[0],
-                end=end,
-                azimuth_deg=float(np.degrees(np.arctan2(z, y))),
-                radius=arm,
-                sign=sign,
-                stiffness=STIFF * EI / (arm**2 * ends[0]),
-                offset=-float(np.median(pulled)) if sign < 0 else 0.0,
-            )
-            search = Identification(_with(robot, (tendon,), EI, arm), recording)
-            fit = search.fit(np.ones(len(recording.time), bool), most=ALONE_ITERATIONS)
-            cost = float(np.sum((fit.error / 0.001) ** 2) + fit.z @ fit.z)
-            if cost < least:
-                best, least = fit.robot.actuation.tendons[0], cost
+def sign_of(robot: RobotDescription, recording: Recording) -> int:
+    """
+    Whether a single motor pulls by going up (1) or down (-1).
 
-    return best
+    A straight body that is bent comes nearer to its base, whichever way it bends.
+    """
+    moved = recording.moved[:, 0]
+    along = (recording.tip - robot.base.T_map_base[:3, 3]) @ robot.base.T_map_base[:3, 0]
+    order, few = np.argsort(moved), max(2, len(moved) // 5)
+    return 1 if along[order[-few:]].mean() < along[order[:few]].mean() else -1
+
+
+def _candidates(
+    robot: RobotDescription, recording: Recording, ends: Sequence[float], arm: float, EI: float
+) -> tuple[list[Tendon], list[float]]:
+    """Fit a motor alone at every end: the tendons found, and what each costs."""
+    sign = sign_of(robot, recording)
+    pulled = sign * recording.moved[:, 0]
+    far = recording.tip[np.argmax(pulled)] - recording.tip[np.argsort(pulled)[:3]].mean(axis=0)
+    _, y, z = robot.base.T_map_base[:3, :3].T @ far
+    tendons, costs = [], []
+    for end in ends:
+        tendon = Tendon(
+            name=recording.motors[0],
+            end=end,
+            azimuth_deg=float(np.degrees(np.arctan2(z, y))),
+            radius=arm,
+            sign=sign,
+            stiffness=STIFF * EI / (arm**2 * ends[0]),
+        )
+        search = Identification(_with(robot, (tendon,), EI, arm), recording)
+        fit = search.fit(np.ones(len(recording.time), bool), most=ALONE_ITERATIONS)
+        tendons.append(fit.robot.actuation.tendons[0])
+        costs.append(float(np.sum((fit.error / MARKER_NOISE) ** 2) + fit.z @ fit.z))
+    return tendons, costs
+
+
+def _shared_out(costs: np.ndarray) -> np.ndarray:
+    """End (M,) of each motor at the least sum of costs (M, G), as many motors to each end."""
+    motors, ends = costs.shape
+    seats = np.repeat(np.arange(ends), -(-motors // ends))
+    rows, chosen = linear_sum_assignment(costs[:, seats])
+    return seats[chosen[np.argsort(rows)]]
 
 
 def _with(
