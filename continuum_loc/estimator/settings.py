@@ -189,7 +189,11 @@ class MechanicsSettings(Settings):
     period: float = Field(
         0.05, ge=0.0, description='least time between two samples that are used [s]'
     )
-    cauchy: float = Field(4.0, gt=0.0, description='scale of the Cauchy loss in sigmas')
+    cauchy: float = Field(
+        1.0,
+        gt=0.0,
+        description='scale of the Cauchy loss in sigmas: what touches something counts little',
+    )
 
 
 class SolverSettings(Settings):
