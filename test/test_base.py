@@ -178,7 +178,7 @@ class CarriedRod(Rod):
 
 
 def carried_stream(world: CarriedRod, duration: float, error=lambda time: np.eye(4), seed=0):
-    """Yield samples of the rod and, before those of the same instant, poses of its base at 100 Hz."""
+    """Yield samples of the rod and, before those of the same instant, poses of its base."""
     rng, frame = np.random.default_rng(seed), world.robot.base.measurement.frame
     told = world.robot.base.measurement
     sigma = np.array([told.sigma_position] * 3 + [np.radians(told.sigma_rotation_deg)] * 3)
