@@ -76,7 +76,7 @@ def test_gradient_is_the_derivative_of_the_squared_error(seed):
     for _ in range(6):
         # The frame hardly moves in an interval: its own step is taken for small.
         x = rng.normal(size=2 * grid.dim)
-        x[-6:] = x[grid.dim - 6 : grid.dim]
+        x[-6:] = x[: grid.dim][-6:]
         forth, back = ends_of(squared, a, b._replace(T_map_frame=a.T_map_frame), x)
         normal = Normal.zeros(2 * grid.dim)
         factor.linearise(batch, a, b._replace(T_map_frame=a.T_map_frame), normal)
@@ -97,7 +97,7 @@ def test_gradient_of_the_prior_of_the_frame(told):
     # Where the base sees the frame from is frozen: exact by the older frame, nearly by the newer.
     for at, tolerance in ((grid.dim, 1e-5), (2 * grid.dim, 0.05)):
         x = np.zeros(2 * grid.dim)
-        x[at - 6 : at] = rng.normal(size=6)
+        x[:at][-6:] = rng.normal(size=6)
         forth, back = ends_of(
             lambda a, b: priors.add(Normal.zeros(2 * grid.dim), a, b)[0], a, b, x
         )

@@ -111,7 +111,7 @@ def _move(window: Window, offsets: list[np.ndarray]) -> int:
     first = len(window.intervals)
     moves = np.abs(_by_node(window, offsets)[:, :, POSE_PART]).max(axis=(1, 2))
     if window.grid.frames:
-        frames = np.array(offsets)[:, window.grid.frame_offset :][:, :6]
+        frames = np.array(offsets)[:, window.grid.frame_rows]
         moves = np.maximum(moves, np.abs(frames).max(axis=1))
     far = moves >= window.settings.solver.relinearise
     for k, offset in enumerate(offsets):

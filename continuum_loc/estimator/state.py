@@ -57,6 +57,7 @@ class Grid:
         self.bias_offset = NODE_DIM * self.nodes
         self.frame_offset = self.bias_offset + 3 * self.biases
         self.dim = self.frame_offset + 6 * self.frames
+        self.frame_rows = slice(self.frame_offset, self.dim)
 
     def node_at(self, s: float) -> int:
         """Return the node at arclength s [m]; every ring has one."""
@@ -127,7 +128,8 @@ def _retract(column, delta):
         for i in range(3):
             column.bias[m, i] += delta[NODE_DIM * nodes + 3 * m + i]
     for f in range(column.T_map_frame.shape[0]):
-        lie_kernels.exp(delta[frame_row(column) :][:6], step)
+        first = frame_row(column)
+        lie_kernels.exp(delta[first:][:6], step)
         lie_kernels.compose(column.T_map_frame[f], step, moved)
         column.T_map_frame[f] = moved
 
