@@ -183,9 +183,6 @@ class Priors:
 def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
     """Pose of the base in the middle of its travel, and `OfColumn.base_information`."""
     base, insertion = robot.base, robot.base.insertion
-    if base.mode != 'fixed':
-        rate = np.repeat(np.square(base.speed), 3)
-        return base.T_map_base, np.stack([np.zeros(6), 1.0 / rate])
     middle = 0.0 if insertion.mode == 'fixed' else float(np.mean(insertion.range))
     sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
     rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
@@ -193,6 +190,9 @@ def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
         sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
         rate[0] = 1.0
     along = lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
+    if base.mode != 'fixed':
+        rate = np.repeat(np.square(base.speed), 3)
+        return base.T_map_base @ along, np.stack([np.zeros(6), 1.0 / rate])
     return base.T_map_base @ along, np.stack([sigma**-2.0, rate**-2.0])
 
 
@@ -219,7 +219,9 @@ def _loosely(spread: tuple[float, float]) -> np.ndarray:
 
 def _start_of(robot: RobotDescription) -> OfStart:
     """Make `OfStart`: a free base is known by its description, a measured one by its frame."""
-    known = 1.0 / _lasting(robot)
+    known, insertion = 1.0 / _lasting(robot), robot.base.insertion
+    if insertion.mode == 'unknown' and robot.base.mode == 'free':
+        known[0] = 1.0 / (1.0 / known[0] + np.ptp(insertion.range) ** 2)
     return OfStart(known if robot.base.mode == 'free' else _loosely(ANYWHERE), known)
 
 

@@ -40,7 +40,7 @@ from continuum_loc.simulator.plant import (
     PlantSettings,
 )
 from continuum_loc.simulator.readout import ReadoutSettings
-from continuum_loc.simulator.trajectories import Drive, trajectory
+from continuum_loc.simulator.trajectories import Drive, levelled, trajectory
 import numpy as np
 
 if TYPE_CHECKING:
@@ -109,12 +109,14 @@ class World:
             start_stamp,
         )
         self.plant = plant if isinstance(plant, PlantSettings) else _plant(plant, robot)
+        self.carried = carrier(carried, robot) if isinstance(carried, str) else carried
+        if self.carried is not None and robot.name == 'engine' and isinstance(trajectory, str):
+            trajectory = levelled(trajectory, robot, self.plant, self.carried.roll)
         self.trajectory = _resolve(trajectory, robot, self.plant)
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
         _check_fidelity(tof_fidelity)
         self.tof_fidelity, self.tof_settings = tof_fidelity, tof_settings
         self.readout, self.T_magnet_true = readout or ReadoutSettings(), T_magnet_true
-        self.carried = carrier(carried, robot) if isinstance(carried, str) else carried
         supported = self.trajectory.supported
         model = build_model(robot, self.plant, scene, profile, supported, self.carried)
         self.body = _Body(robot, self.plant, model, self.trajectory, self.carried)

@@ -140,14 +140,13 @@ class InsertionFactor(_PoseFactor):
 
     def row(self, measurement: EncoderSample) -> Row:
         base = self.robot.base
-        if base.mode == 'free':
-            raise MeasurementError('not used', 'nobody knows what a free base travels from')
         insertion = base.insertion
         travel = travel_of(measurement, insertion)
         T_map_base = self.robot.base.T_map_base.copy()
         T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
-        information[0, 0] = insertion.sigma**-2.0
+        if base.mode == 'fixed':  # what a free one travels from is known at the start alone
+            information[0, 0] = insertion.sigma**-2.0
         return Row(0, 0, T_map_base, information)
 
     @classmethod
@@ -155,8 +154,7 @@ class InsertionFactor(_PoseFactor):
         return setup.robot.base.mode != 'measured' and super().wanted(setup)
 
     def awaited(self):
-        base = self.robot.base
-        return base.mode == 'fixed' and base.insertion.mode == 'measured'
+        return self.robot.base.insertion.mode == 'measured'
 
     def guess(self, row, guess):
         guess.T_map_base = row.T_map_node
