@@ -38,13 +38,31 @@ class RayCaster:
         Returns distance (N,) [m], inf where nothing is hit; face (N,) int64, -1 where nothing is
         hit; and the unit normal (N, 3) of the face, nan where nothing is hit.
         """
+        distance, faces = self._hits(origins, directions)
+        return (
+            distance,
+            faces,
+            np.where((faces < 0)[:, None], np.nan, self.scene.face_normals[faces]),
+        )
+
+    def cast_light(
+        self, origins: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Distance (N,) as by `cast`, and the share (N,) of light that comes back from there.
+
+        That is the reflectance times the cosine of incidence, 0 where nothing is hit.
+        """
+        distance, faces = self._hits(origins, directions)
+        scene = self.scene
+        return distance, _brightness(faces, directions, scene.face_normals, scene.reflectance)
+
+    def _hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
         hits = self._embree.cast_rays(self._tensor(rays))
         faces = hits['primitive_ids'].numpy()
-        missed = faces == self._invalid
-        faces = np.where(missed, -1, faces.astype(np.int64))
-        normals = np.where(missed[:, None], np.nan, self.scene.face_normals[faces])
-        return hits['t_hit'].numpy().astype(float), faces, normals
+        faces = np.where(faces == self._invalid, -1, faces.astype(np.int64))
+        return hits['t_hit'].numpy().astype(float), faces
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) from points (N, 3) to the nearest surface [m], negative inside solids."""
@@ -53,6 +71,15 @@ class RayCaster:
             self._tensor(np.asarray(points, np.float32)), nsamples=_INSIDE_RAYS
         )
         return found.numpy().astype(float)
+
+
+@kernel
+def _brightness(faces, directions, normals, reflectance):
+    light = np.zeros(faces.shape[0])
+    for k in range(faces.shape[0]):
+        if faces[k] >= 0:
+            light[k] = reflectance[faces[k]] * abs(_dot(normals[faces[k]], directions[k]))
+    return light
 
 
 @kernel
