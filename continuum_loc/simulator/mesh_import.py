@@ -10,8 +10,8 @@ from pathlib import Path
 
 from continuum_loc.errors import MapError, SceneError
 from continuum_loc.extras import require
-from continuum_loc.mapping.formats.shapes import Cloud
-from continuum_loc.mapping.map_files import read_shape
+from continuum_loc.formats.reading import read_shape
+from continuum_loc.formats.shapes import Cloud
 from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scene_cache import cached_scene
