@@ -21,6 +21,7 @@ from continuum_loc.estimator.readings import gyro_cause, range_cause, strain_cau
 from continuum_loc.estimator.settings import DoubtSettings
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     ImuSample,
     Measurement,
@@ -319,7 +320,7 @@ class Doubts:
 
 def _source(measurement: Measurement) -> str:
     """Name under which a measurement's sensor is accused."""
-    kinds = {StrainSample: 'strain', EncoderSample: 'insertion'}
+    kinds = {StrainSample: 'strain', EncoderSample: 'insertion', BaseSample: 'base'}
     return kinds.get(type(measurement)) or getattr(measurement, 'sensor', '')
 
 

@@ -82,6 +82,7 @@ class SimulatorNode(PackageNode):
             'imu/mag': self.robot.hall,
             'strain': self.robot.strain,
             'joint_states': True,
+            'base/pose': self.robot.base.mode == 'measured',
             'ground_truth/poses': True,
         }
         return [topic for topic, present in kinds.items() if present] + [

@@ -22,6 +22,7 @@ from typing import Any
 
 from continuum_loc import lie
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -39,8 +40,17 @@ from scipy.spatial.transform import Rotation
 
 
 def source(sample: Any) -> str:
-    """Name of what a sample comes from: its sensor, else `strain`, `joint_states` or `truth`."""
-    kinds = {StrainSample: 'strain', EncoderSample: 'joint_states', TruthSample: 'truth'}
+    """
+    Name of what a sample comes from.
+
+    Its sensor, else `strain`, `joint_states`, `base` or `truth`.
+    """
+    kinds = {
+        StrainSample: 'strain',
+        EncoderSample: 'joint_states',
+        BaseSample: 'base',
+        TruthSample: 'truth',
+    }
     return kinds.get(type(sample)) or sample.sensor
 
 

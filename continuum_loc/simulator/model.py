@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import mujoco
 
 GRAVITY = 9.81
+SCALAR_LAST = np.array([1, 2, 3, 0])  # MuJoCo's w comes first, scipy's last
 ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
 NODE_PREFIX = 'node'
 REST_SPEED = 1e-4
@@ -132,8 +133,8 @@ def _add_twist_torque(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """
     excess = model.jnt_user[:, 0]
     joints = np.flatnonzero(excess)
-    quat = data.qpos[model.jnt_qposadr[joints, None] + np.arange(4)]
-    w = Rotation.from_quat(quat, scalar_first=True).as_rotvec()
+    quat = data.qpos[model.jnt_qposadr[joints, None] + SCALAR_LAST]
+    w = Rotation.from_quat(quat).as_rotvec()
     lever = np.stack([np.ones(len(joints)), -w[:, 2] / 2.0, w[:, 1] / 2.0], axis=1)
     torque = (excess[joints] * w[:, 0])[:, None] * lever
     data.qfrc_applied[model.jnt_dofadr[joints, None] + np.arange(3)] = torque
@@ -237,7 +238,7 @@ def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
     """
     mujoco = require('mujoco', 'simulate')
 
-    quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
+    quat = np.roll(Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(), 1)
     carriage = spec.worldbody.add_body(name='carriage', pos=robot.base.xyz, quat=quat)
     if robot.base.insertion.mode != 'fixed':
         carriage.add_joint(
