@@ -103,9 +103,7 @@ class Motion:
         self, time: float, frames: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Pose T_map_frame (F, 4, 4), body twist (F, 6) and acceleration of the origin (F, 3).
-
-        Twists are [v; w]; the acceleration is in map.
+        Pose (F, 4, 4) and acceleration (F, 3) in map, and body twist (F, 6) [v; w], of frames.
 
         `frames` are the four states of `frames()`. The acceleration is the second difference of
         position, linear between the steps.
@@ -131,11 +129,7 @@ class Motion:
         )
 
     def encoders(self, time: float) -> tuple[float, np.ndarray, np.ndarray]:
-        """
-        Read insertion [m], tendon lengths (K,) [m] and tensions (K,) [N] at `time`.
-
-        They are linear between the steps.
-        """
+        """Read insertion [m], tendon lengths [m] and tensions [N] (K,), linear between steps."""
         u, _ = self._at(time)
         a, b = self._states[1], self._states[2]
         return tuple(
@@ -150,9 +144,7 @@ class Motion:
 
 def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
     """
-    (N, 6) strain [nu; omega] of each segment.
-
-    The screw that takes one node to the next, per unit of s.
+    (N, 6) strain [nu; omega] of each segment: the screw from node to node, per unit of s.
 
     For pure bending this is the constant-curvature arc that is tangent to both links at their
     middles.

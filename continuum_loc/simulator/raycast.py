@@ -1,8 +1,4 @@
-"""
-Ray casting.
-
-The scene by Embree (through Open3D), the robot's own body as capsules by a compiled kernel.
-"""
+"""Ray casting: the scene by Embree (through Open3D), the robot's own body by a compiled kernel."""
 
 from __future__ import annotations
 
@@ -85,9 +81,7 @@ def _brightness(faces, directions, normals, reflectance):
 @kernel
 def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndarray) -> np.ndarray:
     """
-    Distance (S, K) along the K unit rays of S fans to the first of M capsules.
-
-    inf where none is hit.
+    Distance (S, K) along the K unit rays of S fans to the first of M capsules; inf for none.
 
     origins: (S, 3). directions: (S, K, 3). Each capsule (M, 7) is ax ay az bx by bz radius: all
     points within `radius` of the segment from a to b. A fan that starts inside a capsule (its own
@@ -140,11 +134,7 @@ def _enclosing_cone(directions):
 
 @kernel
 def _outside_cone(cone_axis, half_angle, axis, offset, radius):
-    """
-    Tell where a capsule's bounding ball is clear of the fan's cone.
-
-    This sifts out nearly all of the body at once.
-    """
+    """Tell where a capsule's ball is clear of the fan's cone, as most of the body is."""
     to_centre = 0.5 * axis - offset
     reach = 0.5 * np.sqrt(_dot(axis, axis)) + radius
     distance = np.sqrt(_dot(to_centre, to_centre))

@@ -1,7 +1,5 @@
 """
-What a VL53L5CX makes of the light that comes back.
-
-One perpendicular distance and a status for each zone.
+What a VL53L5CX makes of the light that comes back: a distance and a status for each zone.
 
 A zone sees 4x4 sub-rays over its solid angle. Their light lies on a histogram of depth (distance
 along the optical axis); pulses nearer than the pulse's width merge, which puts mixed readings
@@ -37,11 +35,7 @@ _FORGETS = 0.05  # share of the way to 1 m that a distance in the registers goes
 
 
 class Vl53l5cxReceiver:
-    """
-    Turns sub-ray echoes into readings.
-
-    It keeps what each unit has of its own and remembers (`vl53l5cx_unit.Units`).
-    """
+    """Turns sub-ray echoes into readings; `vl53l5cx_unit.Units` are what it remembers."""
 
     def __init__(self, tof_model: TofModel, settings: Vl53l5cxSettings | None = None) -> None:
         self._model, self._settings = tof_model, settings or Vl53l5cxSettings()
@@ -94,11 +88,7 @@ class Vl53l5cxReceiver:
         self._units.update(zip(names, units.apart(), strict=True))
 
     def _own_targets(self, echoes: Echoes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """
-        Depth, signal and spread (S, Z) of each zone's target, before crosstalk.
-
-        Signal is 0 where there is none.
-        """
+        """Depth, signal (0: none) and spread (S, Z) of each zone's target, before crosstalk."""
         zones, sub_rays = self._sub_directions.shape[:2]
         distance = echoes.distance.reshape(-1, sub_rays)
         seen = np.isfinite(distance)
