@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
+from continuum_loc.estimator.base_watch import BaseWatch
 from continuum_loc.estimator.explain import Explanation, explanations, Round, Stretch
 from continuum_loc.estimator.factors import Factor, Setup
 from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, share_by_factor
@@ -66,6 +67,7 @@ class Doubts:
         named = {factor.name for factor in factors}
         self._gyro_names = [imu.name for imu in setup.robot.imu if 'gyro' in named]
         self._patrolled, self._next_patrol = 0, PATROL
+        self._base = BaseWatch(setup, window)
         self._off = False  # the window does not fit, and no round of explanations has been yet
         self._next_round, self._backoff, self._next_reading = 0.0, 1.0, 0.0
         self._unused = self._is_unused(setup)
@@ -104,6 +106,7 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
+        self._tell(('base',), self._base.cause(time), time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time, epoch)

@@ -33,6 +33,7 @@ import numpy as np
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
 BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
 MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in motion
+BASE_PLAIN = 39.0  # chi-squared of twelve degrees of freedom at 1e-4
 ANYWHERE = (10.0, 3.0)  # [m, rad] spread of a base of which nothing is known but its measurement
 ASTRAY = (0.1, 0.2)  # [m, rad] spread about where a carried base, or its frame, was last
 STEADY = (1e-4, 1e-4)  # [m/sqrt(s), rad/sqrt(s)] drift of odometry at rest
@@ -391,14 +392,26 @@ def _add_space(normal, column, prior, share, work):
 
 @kernel
 def _add_base(normal, column, prior, share, work):
-    """Add the base's pose and velocity; the squared error."""
+    """
+    Add the base's pose and velocity; twice their cost.
+
+    A base that all the rest has far from where it should be is let go: a square up to BASE_PLAIN,
+    and its logarithm beyond.
+    """
     at, velocity = work[0], column.velocity[0]
     lie_kernels.pose_error(prior.T_map_base, column.T[0], at.xi, at.right, at.scratch)
     error, J, squared = at.xi.x, at.right, 0.0
     for i in range(6):
+        information = prior.base_information[0, i]
+        rate = prior.base_information[1, i]
+        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
+    if squared > BASE_PLAIN:
+        share *= BASE_PLAIN / squared
+        squared *= 1.0 + np.log(squared / BASE_PLAIN)
+    cost = share * squared
+    for i in range(6):
         information = prior.base_information[0, i] * share
         rate = prior.base_information[1, i] * share
-        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
         for j in range(6):
             weighted = information * J[i, j]
             normal.g[j] += weighted * error[i]
@@ -406,4 +419,4 @@ def _add_base(normal, column, prior, share, work):
                 normal.H[j, k] += weighted * J[i, k]
         normal.H[VELOCITY + i, VELOCITY + i] += rate
         normal.g[VELOCITY + i] += rate * velocity[i]
-    return squared
+    return cost
