@@ -222,7 +222,8 @@ class Doubts:
         """Explanations, first those by a gyro that shares its ring with what does not fit."""
         robot = self._setup.robot
         shares = fit_of(self._window.intervals[-NEWEST:]).shares
-        rings = {robot.sensor(name).ring for name, share in shares.items() if share < LOW_SHARE}
+        low = {name for name, share in shares.items() if share < LOW_SHARE}
+        rings = {sensor.ring for sensor in robot.sensors if sensor.name in low}
         if len(rings) > len(robot.rings) / 2:
             return self._candidates
         gyros = {imu.name for imu in robot.imu if imu.ring in rings}

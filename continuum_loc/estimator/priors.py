@@ -33,6 +33,7 @@ import numpy as np
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
 BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
 MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in motion
+LET_GO = 1e-6  # of the information on a fixed base that is found to be elsewhere
 BASE_PLAIN = 39.0  # chi-squared of twelve degrees of freedom at 1e-4
 ANYWHERE = (10.0, 3.0)  # [m, rad] spread of a base of which nothing is known but its measurement
 ASTRAY = (0.1, 0.2)  # [m, rad] spread about where a carried base, or its frame, was last
@@ -95,12 +96,14 @@ class Priors:
         self.rest = np.array(robot.backbone.rest_strain)
         share = prior.velocity_at_base
         grown = share + (1.0 - share) * (grid.s / grid.s[-1]) ** 2
-        self.velocity_psd = grown[:, None] * np.array(prior.velocity) + _carried(robot, grid)
+        self._held_psd = grown[:, None] * np.array(prior.velocity)
+        self._carried_psd = self._held_psd + _carried(robot, grid)
+        self._carried = robot.base.mode != 'fixed'
+        self.velocity_psd = self._carried_psd if self._carried else self._held_psd
         self.inverse_strain_rate_psd = 1.0 / np.array(prior.strain_rate)
         step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
         self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
-        self.T_map_base, base_information = _base_of(robot)
-        self._carried = robot.base.mode != 'fixed'
+        self.T_map_base, self._base_information = _base_of(robot)
         self._drifts = robot.base.measurement.drift > 0.0
         self._own_frame = self._drifts or robot.base.measurement.frame != 'map'
         self._of_frame, self._of_start = _frame_of(robot), _start_of(robot)
@@ -121,8 +124,22 @@ class Priors:
             self.rest,
             1.0 / np.square(robot.backbone.rest_strain_sigma),
             self.T_map_base,
-            base_information,
+            self._base_information,
         )
+
+    def let_go(self, loose: bool) -> bool:
+        """
+        Take a fixed base for one that is carried, or believe it again; True if that is new.
+
+        For a base of which it was found that it is not where it is said to be.
+        """
+        if self._carried or loose == (self.velocity_psd is self._carried_psd):
+            return False
+        self.velocity_psd = self._carried_psd if loose else self._held_psd
+        self._in_time = self._in_time._replace(inverse_velocity_psd=1.0 / self.velocity_psd)
+        information = LET_GO * self._base_information if loose else self._base_information
+        self._of_column = self._of_column._replace(base_information=information)
+        return True
 
     def start(
         self,
@@ -199,8 +216,6 @@ def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
 
 def _carried(robot: RobotDescription, grid: Grid) -> np.ndarray:
     """(N, 6) process noise of nodes that are carried along by their base, as if straight."""
-    if robot.base.mode == 'fixed':
-        return np.zeros((grid.nodes, 6))
     shift, turn = robot.base.acceleration
     psd = np.empty((grid.nodes, 6))
     psd[:, 0], psd[:, 3:] = shift, turn
