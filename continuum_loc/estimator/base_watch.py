@@ -1,9 +1,9 @@
 """
 Whether the base is where it is said to be, by the description or by what measures it.
 
-The prior of a fixed base lets go where everything else has the base far from it (`priors`), and a
-measured base's frame moves away from where its errors could be; so the estimate itself shows how
-far off they are.
+The prior of a fixed base and its encoder let go where everything else has the base far from them
+(`priors`, `factors/pose.py`), and a measured base's frame moves away from where its errors could
+be; so the estimate itself shows how far off they are.
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ from __future__ import annotations
 from continuum_loc import lie
 from continuum_loc.estimator.factors import Setup
 from continuum_loc.estimator.window import Window
+from continuum_loc.measurements import EncoderSample, Measurement
 import numpy as np
 
 FAR_SQUARED = 27.9  # chi-squared of six degrees of freedom at 1e-4
-PATIENCE = 0.2  # [s] that it must last
+FAR_ALONG = 15.1  # of one
+PATIENCE = 0.15  # [s] that it must last
+INSERTION = 'insertion'
 
 
 class BaseWatch:
@@ -22,35 +25,56 @@ class BaseWatch:
 
     def __init__(self, setup: Setup, window: Window):
         base = setup.robot.base
-        self._mode, self._window, self._grid = base.mode, window, setup.grid
+        self._base, self._window, self._grid = base, window, setup.grid
         sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
         self._variance = np.square(sigma)
-        self._inserted = base.insertion.mode != 'fixed'
         self._stays = base.measurement.frame == 'map' and base.measurement.drift == 0.0
-        self._T_map_base = base.T_map_base
-        self._since: float | None = None
+        self._travel: tuple[float, float] | None = None  # [s], [m]
+        self._since: dict[str, float] = {}
 
-    def cause(self, time: float) -> str:
-        """Say how the base is off at `time` [s], once that has lasted; empty where it is not."""
-        said = ''
-        if self._mode == 'fixed':
-            said = self._off(*self._from_description(), 'is not where the description has it')
-        elif self._mode == 'measured' and self._stays:
-            said = self._off(*self._from_measurement(), 'is not where it is told to be')
-        if not said:
-            self._since = None
-            return ''
-        self._since = time if self._since is None else self._since
-        return said if time - self._since >= PATIENCE else ''
+    def note(self, measurement: Measurement, time: float) -> None:
+        """Keep the newest travel of a base whose encoder tells it."""
+        if isinstance(measurement, EncoderSample) and INSERTION in measurement.names:
+            travel = float(measurement.position[measurement.names.index(INSERTION)])
+            self._travel = (time, travel)
 
-    def _from_description(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose error (6,) of the first node, and its Jacobian (6, D) in the newest column."""
-        T = self._window.column(-1).T[0]
-        e, J = lie.log(lie.inverse(self._T_map_base) @ T), np.zeros((6, self._grid.dim))
+    def causes(self, time: float) -> dict[str, str]:
+        """Say how base and encoder are off at `time` [s], once that has lasted; else nothing."""
+        found = {'base': '', INSERTION: ''}
+        if self._base.mode == 'fixed':
+            found |= self._from_description()
+        elif self._base.mode == 'measured' and self._stays:
+            found['base'] = self._off(*self._from_measurement(), 'is not where it is told to be')
+        for name, said in found.items():
+            if not said:
+                self._since.pop(name, None)
+            elif time - self._since.setdefault(name, time) < PATIENCE:
+                found[name] = ''
+        return found
+
+    def _from_description(self) -> dict[str, str]:
+        """Compare with the description across the axis, and with the encoder along it."""
+        T, J = self._window.column(-1).T[0], np.zeros((6, self._grid.dim))
         J[:, :6] = np.eye(6)
-        if self._inserted:  # along its axis an encoder tells, or nobody
+        mode = self._base.insertion.mode
+        said = {}
+        if mode == 'measured' and self._travel is not None:
+            said[INSERTION] = self._off_along(J[:1])
+        e = lie.log(lie.inverse(self._base.T_map_base) @ T)
+        if mode != 'fixed':
             e[0], J[0] = 0.0, 0.0
-        return e, J
+        return said | {'base': self._off(e, J, 'is not where the description has it')}
+
+    def _off_along(self, J: np.ndarray) -> str:
+        """Compare the travel with the newest that the encoder told, at its time."""
+        time, travel = self._travel
+        first, last = self._window.columns[0].time, self._window.columns[-1].time
+        at = self._window.body(min(max(time, first), last)).T[0]
+        e = (lie.inverse(self._base.T_map_base) @ at)[0, 3] - travel
+        variance = self._variance[0] + self._base.insertion.sigma**2
+        if e * e / variance < FAR_ALONG or e * e / (variance + self._own(J)[0, 0]) < FAR_ALONG:
+            return ''
+        return f'contradicts the rest ({1e3 * abs(e):.0f} mm off)'
 
     def _from_measurement(self) -> tuple[np.ndarray, np.ndarray]:
         """Error (6,) of the frame, as the base sees it, and its Jacobian (6, D)."""
@@ -60,12 +84,15 @@ class BaseWatch:
         J[:, self._grid.frame_rows] = seen
         return seen @ lie.log(column.T_map_frame[0]), J
 
+    def _own(self, J: np.ndarray) -> np.ndarray:
+        """Covariance of what J (m, D) says of the newest column."""
+        last = len(self._window.columns) - 1
+        return self._window.chain.covariance(last - 1, np.zeros(J.shape), J)
+
     def _off(self, e: np.ndarray, J: np.ndarray, words: str) -> str:
         if e @ (e / self._variance) < FAR_SQUARED:
             return ''
-        last, D = len(self._window.columns) - 1, self._grid.dim
-        own = self._window.chain.covariance(last - 1, np.zeros((6, D)), J)
-        spread = np.diag(self._variance) + own
+        spread = np.diag(self._variance) + self._own(J)
         if e @ np.linalg.solve(spread, e) < FAR_SQUARED:
             return ''
         shift, turn = np.linalg.norm(e[:3]), np.degrees(np.linalg.norm(e[3:]))

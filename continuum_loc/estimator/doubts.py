@@ -80,6 +80,7 @@ class Doubts:
             return
         if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
+            self._base.note(measurement, time)
         self._read_at_once(measurement, time)
 
     def _read_at_once(self, measurement: Measurement, time: float) -> None:
@@ -106,7 +107,8 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
-        self._tell(('base',), self._base.cause(time), time)
+        for name, cause in self._base.causes(time).items():
+            self._tell((name,), cause, time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time, epoch)

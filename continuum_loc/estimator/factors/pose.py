@@ -135,8 +135,8 @@ class InsertionFactor(_PoseFactor):
 
     name = 'insertion'
     consumes = EncoderSample
-    cauchy = 5.0  # an encoder that all the rest contradicts is let go, one within 5 sigma is not
-    plain = 25.0
+    cauchy = 2.0  # an encoder that all the rest contradicts is let go, one within 5 sigma is not
+    plain = 9.0
 
     def __init__(self, setup):
         super().__init__(setup, ['insertion'])
