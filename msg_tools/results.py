@@ -20,7 +20,14 @@ from msg_tools.geometry import (
     vector,
     vector_message,
 )
-from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord, TipRecord
+from msg_tools.records import (
+    CloudRecord,
+    DiagnosticsRecord,
+    FrameRecord,
+    PathRecord,
+    PosesRecord,
+    TipRecord,
+)
 import numpy as np
 
 
@@ -106,6 +113,28 @@ def tip_record(message: Any, where: str = 'tip') -> TipRecord:
         velocity,
         velocity_covariance,
     )
+
+
+def frame_message(make: Messages, item: Any) -> Any:
+    """PoseWithCovarianceStamped in `map` of a measured base's frame: an Estimate or a record."""
+    covariance = ros_covariance(item.frame_covariance, item.T_map_frame[:3, :3])
+    return make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        header=header_message(make, item.stamp, MAP),
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(make, item.T_map_frame),
+            covariance=covariance,
+        ),
+    )
+
+
+def frame_record(message: Any, where: str = 'base/frame') -> FrameRecord:
+    """Read where the frame of a measured base lies in `map`."""
+    require_map(message.header, where)
+    T = transforms_of([message.pose.pose], where)[0]
+    covariance = body_covariance(message.pose.covariance, T[:3, :3], where)
+    return FrameRecord(stamp_of(message.header, where), T, covariance)
 
 
 def columns_message(make: Messages, cloud: CloudRecord, frame_id: str = MAP) -> Any:

@@ -114,6 +114,7 @@ TOPICS: dict[str, Topic] = {
         lambda make, item: results.tip_message(make, tip_of(item), 'tip'),
         _read(results.tip_record),
     ),
+    'base/frame': Topic(_POSE, results.frame_message, _read(results.frame_record)),
     'reconstruction': Topic(
         'sensor_msgs/msg/PointCloud2', results.columns_message, _read(results.cloud_record)
     ),
@@ -146,6 +147,7 @@ OUTPUTS = (
     'poses',
     'backbone',
     'tip',
+    'base/frame',
     'reconstruction',
     'prior_map',
     'shape/poses',

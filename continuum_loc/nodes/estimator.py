@@ -132,6 +132,8 @@ class EstimatorNode(WorkerNode):
         child = self.settings.frame_prefix + self.robot.ring_names[-1]
         self.publish_message('tip', tip_message(ros_messages(), tip_of(estimate), child))
         self.publish('backbone', estimate)
+        if estimate.T_map_frame is not None:
+            self.publish('base/frame', estimate)
         if self.frames is not None and self.settings.publish_tf:
             self.frames.send(estimate.stamp, estimate.T_map_ring)
         self.recent.add(estimate)
