@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from continuum_loc.measurements import Measurement
+from continuum_loc.measurements import BaseSample, Measurement
 from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import ShapeNodeSettings
 from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
@@ -26,7 +26,7 @@ AFTER_TARING = 1.0  # s of the rehearsal: estimates, and a check of the wiring
 class ShapeNode(WorkerNode):
     """The shape estimator on a graph."""
 
-    inputs = ('imu/data_raw', 'imu/mag')
+    inputs = ('imu/data_raw', 'imu/mag', 'joint_states', 'base/pose', 'base/odom')
 
     def __init__(self, **options: Any) -> None:
         super().__init__('shape', ShapeNodeSettings(), **options)
@@ -100,8 +100,11 @@ def rehearse(robot: RobotDescription, settings: ShapeSettings) -> ShapeEstimate 
     """
     own = settings.model_copy(update={'calibration': None, 'start': 'straight'})
     estimator, arm = ShapeEstimator(robot, own), Arm(robot)
+    told = ()
+    if robot.base.mode == 'measured':
+        told = (BaseSample(0, robot.base.measurement.frame, robot.base.T_map_base),)
     at_rest = Motion([arm.posture()], [own.taring_seconds + AFTER_TARING], [0.0])
-    made = [estimator.process(sample) for sample in arm.record(at_rest)]
+    made = [estimator.process(sample) for sample in (*told, *arm.record(at_rest))]
     return next((estimate for estimate in reversed(made) if estimate is not None), None)
 
 
