@@ -22,27 +22,6 @@ EXPLAINED = 0.7  # share of what is read that a cause has to account for
 EXCITED = 9.0  # squared motion over the noise's, below which nothing can be told
 
 
-def gyro_cause(body: np.ndarray, read: np.ndarray, sigma: float, bias: float) -> str:
-    """
-    Say what is wrong with a gyro, or ''.
-
-    body, read: (K, 3) angular velocities of the body and of the sensor, in the sensor's frame
-    [rad/s]. sigma: of a sample; bias: the largest that is likely [rad/s].
-    """
-    count = read.size
-    if len(read) < 10 or np.sum(body**2) < EXCITED * sigma**2 * count:
-        return ''
-    as_read = _squares(body - read, sigma, bias)
-    if as_read < MISFIT * count:
-        return ''
-    left = {
-        cause: _squares(body - read @ M.T, sigma, bias)
-        for cause, M in GYRO_CAUSES
-        if _explained(read, body @ np.linalg.inv(M).T) > EXPLAINED
-    }
-    return _clear(left, as_read, count)
-
-
 def travel_cause(travel: float, limits: tuple[float, float]) -> str:
     """Say that an encoder reads what its base cannot travel [m], or ''."""
     least, most = limits[0] - TRAVEL_SLACK, limits[1] + TRAVEL_SLACK
@@ -63,53 +42,13 @@ def range_cause(ranges: np.ndarray, max_range: float) -> str:
     return f'reads {np.median(read):.4g} m where {max_range:g} m is its reach: millimetres?'
 
 
-def strain_cause(body: np.ndarray, theta: np.ndarray, kappa: np.ndarray, sigma: float) -> str:
-    """
-    Say what is wrong with a strain sensor, or ''.
-
-    body: (K, 2) bending of the body [1/m]; theta, kappa: (K,) as read; sigma: of a reading [1/m].
-    """
-    if len(kappa) < 10 or np.sum(body**2) < EXCITED * sigma**2 * body.size:
-        return ''
-    as_read = _squares(body - _bending(theta, kappa), sigma, 0.0)
-    if as_read < MISFIT * body.size:
-        return ''
-    left = {
-        cause: _squares(body - _bending(*change(theta, kappa)), sigma, 0.0)
-        for cause, change in STRAIN_CAUSES.items()
-    }
-    return _clear(left, as_read, body.size)
-
-
-def _clear(left: dict[str, float], as_read: float, count: int) -> str:
-    """Choose the likeliest cause, where it explains nearly all; of equal ones the first."""
-    least = min(left.values(), default=np.inf)
-    if BETTER * least > as_read:
-        return ''
-    return next(cause for cause, squares in left.items() if squares <= 1.2 * least + count)
-
-
-def _explained(read: np.ndarray, meant: np.ndarray) -> float:
-    """
-    Share of the readings' squares that what would have been read explains.
-
-    A sensor that rattles reads much of which the body knows nothing.
-    """
-    return 1.0 - float(np.sum((read - meant) ** 2) / max(np.sum(read**2), 1e-30))
-
-
-def _squares(error: np.ndarray, sigma: float, bias: float) -> float:
-    """Sum of squares over the noise's, without a constant up to `bias`."""
-    constant = np.clip(np.mean(error, axis=0), -bias, bias)
-    return float(np.sum((error - constant) ** 2)) / sigma**2
-
-
-def _bending(theta: np.ndarray, kappa: np.ndarray) -> np.ndarray:
+def bending_read(theta: np.ndarray, kappa: np.ndarray) -> np.ndarray:
+    """Return the bending (K, 2) of angles and curvatures (K,)."""
     return np.column_stack([-kappa * np.sin(theta), kappa * np.cos(theta)])
 
 
-def _signed_axes() -> list[tuple[str, np.ndarray]]:
-    """All ways but one to exchange axes and signs, those that change least first."""
+def _signed_axes() -> list[tuple[str, np.ndarray, int]]:
+    """All ways but one to exchange axes and signs, and how many changes each is, fewest first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         moved = sum(place != axis for place, axis in enumerate(order))
@@ -117,7 +56,7 @@ def _signed_axes() -> list[tuple[str, np.ndarray]]:
         if moved or flipped:
             M = np.diag(signs) @ np.eye(3)[list(order)]
             found.append((moved + len(flipped), _named(M, moved, flipped), M))
-    return [(cause, M) for _, cause, M in sorted(found, key=lambda one: one[0])]
+    return [(cause, M, changes) for changes, cause, M in sorted(found, key=lambda one: one[0])]
 
 
 def _named(M: np.ndarray, moved: int, flipped: list[str]) -> str:
@@ -132,8 +71,8 @@ def _named(M: np.ndarray, moved: int, flipped: list[str]) -> str:
 
 
 GYRO_CAUSES = [
-    ('turns 57 times too fast: degrees per second?', np.eye(3) / DEGREES),
-    ('turns 57 times too slowly: converted to radians twice?', np.eye(3) * DEGREES),
+    ('turns 57 times too fast: degrees per second?', np.eye(3) / DEGREES, 1),
+    ('turns 57 times too slowly: converted to radians twice?', np.eye(3) * DEGREES, 1),
     *_signed_axes(),
 ]
 STRAIN_CAUSES = {
