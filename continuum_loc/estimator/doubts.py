@@ -22,6 +22,7 @@ from continuum_loc.estimator.settings import DoubtSettings
 from continuum_loc.estimator.turning import TurnWatch
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     ImuSample,
     Measurement,
@@ -259,5 +260,5 @@ def watches(setup: Setup, factors: Sequence[Factor]) -> tuple[TurnWatch | None, 
 
 def _source(measurement: Measurement) -> str:
     """Name under which a measurement's sensor is accused."""
-    kinds = {StrainSample: 'strain', EncoderSample: 'insertion'}
+    kinds = {StrainSample: 'strain', EncoderSample: 'insertion', BaseSample: 'base'}
     return kinds.get(type(measurement)) or getattr(measurement, 'sensor', '')

@@ -37,6 +37,7 @@ class Kept:
     chain: Chain
     pinned: bool
     moving: bool
+    first: Column
 
 
 class Window:
@@ -55,6 +56,8 @@ class Window:
         self.chain: Chain | None = None
         self.pinned = self._moving = False
         self._bias: tuple[np.ndarray, np.ndarray] | None = None
+        self._first: Column | None = None  # what the prior of the start is about
+        self.wandered = False  # once the body was found: what was known of its base is outdated
 
     def start(self, column: Column) -> None:
         """Begin with one column at rest."""
@@ -95,7 +98,7 @@ class Window:
 
         `moving` says that the body may be in motion there.
         """
-        self._moving, self.pinned = moving, False
+        self._moving, self.pinned, self._first = moving, False, self.columns[0]
         self.chain = Chain(self.grid.dim, self._start())
         self.mark_changed()
 
@@ -121,13 +124,14 @@ class Window:
             self.chain,
             self.pinned,
             self._moving,
+            self._first,
         )
 
     def restore(self, kept: Kept) -> None:
         """Go back to a snapshot; intervals were linearised elsewhere since, so solve again."""
         self.columns, self.offsets = list(kept.columns), list(kept.offsets)
         self.intervals, self.chain = list(kept.intervals), kept.chain
-        self.pinned, self._moving = kept.pinned, kept.moving
+        self.pinned, self._moving, self._first = kept.pinned, kept.moving, kept.first
         self.mark_changed()
 
     def place(self, shape: Column) -> None:
@@ -150,10 +154,10 @@ class Window:
         self.chain.marginals[0] = self._start()
 
     def _start(self) -> Normal:
-        start = self.priors.start(self.columns[0], self._moving)
+        start = self.priors.start(self.columns[0], self._first, self._moving, self.wandered)
         if self._bias is not None:
             weight, mean = self._bias
-            at = np.arange(self.grid.bias_offset, self.grid.dim)
+            at = np.arange(self.grid.bias_offset, self.grid.frame_offset)
             start.H[at, at] += weight
             start.g[at] += weight * (self.columns[0].bias.ravel() - mean)
         return start

@@ -24,6 +24,7 @@ KINDS = {  # topic -> what a filter counts it as
     'strain': 'StrainSample',
     'tracker/': 'TrackedPose',
     'joint_states': 'EncoderSample',
+    'base/': 'BaseSample',
 }
 TRUTH = 'ground_truth/poses'
 BAG = 'bag'  # for what is wrong with all of it
@@ -101,6 +102,7 @@ def wanted_topics(robot: RobotDescription, settings: Any) -> list[str]:
         'strain': robot.strain is not None and on('strain'),
         'tracker/': robot.trackers and on('tracker'),
         'joint_states': robot.base.insertion.mode == 'measured' and hasattr(settings, 'tof'),
+        'base/': robot.base.mode == 'measured' and on('base'),
     }
     return [name for name, wanted in has.items() if wanted]
 
@@ -213,7 +215,7 @@ def _honesty(figure: float) -> str:
 
 
 def _is(name: str, topic: str) -> bool:
-    return name.startswith(topic) if topic == 'tracker/' else name == topic
+    return name.startswith(topic) if topic.endswith('/') else name == topic
 
 
 def _sum(counts: Mapping[str, int], topic: str) -> int:

@@ -27,7 +27,7 @@ def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> Replay
 
 def trial_map_file(trial: Trial) -> Path:
     """Name the file of the prior map that the estimator is given in a trial."""
-    from continuum_loc.offline.disturbed import scanned_map_file
+    from continuum_loc.offline.scanned_maps import scanned_map_file
 
     nominal = scene_map_file(trial.map_scene or trial.scene)
     departures = trial.departures

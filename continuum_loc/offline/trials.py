@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from continuum_loc.simulator.departures import Departures
+    from continuum_loc.simulator.scene import Scene
     from continuum_loc.simulator.world import World
 
 # What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 MOUNTING_ERROR = (0.002, 1.0)  # m, deg
 GYRO_BIAS = 0.01  # rad/s
 TOF_CLOCK_OFFSET = 0.010  # s
+NOWHERE = 'none'  # a scene of empty space, without ToF frames
 
 
 @dataclass(frozen=True)
@@ -115,21 +117,9 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         robot = _base_drawn(robot, trial.seed)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
-    scene = load_scene(trial.scene) if robot.tof else None
+    scene = load_scene(trial.scene) if robot.tof and trial.scene != NOWHERE else None
     if trial.world != 'ideal':
-        from continuum_loc.offline.disturbed import true_world
-
-        return true_world(
-            robot,
-            scene,
-            trial.trajectory,
-            trial.departures,
-            seed=trial.seed,
-            fidelity=trial.fidelity,
-            plant=trial.plant,
-            profile=trial.profile,
-            faults=faults,
-        )
+        return _true_world(robot, scene, trial, faults)
     return World(
         robot,
         scene,
@@ -139,6 +129,36 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         tof_fidelity=trial.fidelity,
         seed=trial.seed,
         faults=faults,
+    )
+
+
+def _true_world(
+    robot: RobotDescription, scene: Scene | None, trial: Trial, faults: tuple
+) -> World:
+    """
+    Make the world of a trial as it truly is, of a robot as it is described.
+
+    The drives pull as the nominal plant has it: what the true one does with that is its own. The
+    estimator gets the nominal robot and its own settings, and nothing of what is drawn here.
+    """
+    from continuum_loc.simulator import departures as true
+    from continuum_loc.simulator.plant import load_plant
+    from continuum_loc.simulator.trajectories import trajectory as path_of
+    from continuum_loc.simulator.world import World
+
+    departures, fidelity, seed = trial.departures, trial.fidelity, trial.seed
+    nominal = load_plant(trial.plant or robot.name)
+    return World(
+        true.true_robot(robot, departures, seed),
+        scene,
+        path_of(trial.trajectory, robot, nominal),
+        plant=true.true_plant(nominal, departures, seed),
+        profile=trial.profile,
+        tof_fidelity=fidelity,
+        tof_settings=true.tof_settings(departures, fidelity),
+        T_magnet_true=true.magnet_error(departures, seed),
+        seed=seed,
+        faults=(*faults, *true.sensor_departures(robot, departures, fidelity, seed)),
     )
 
 

@@ -1,7 +1,5 @@
 """
-The robot as a MuJoCo model.
-
-A rod of rigid links on ball joints, tendons, an insertion drive, contacts.
+The robot as a MuJoCo model: rigid links on ball joints, tendons, an insertion drive, contacts.
 
 Nodes at s_0 = 0 ... s_N = L. Body i is rigid and centred on node i; it reaches half a segment to
 each side, and neighbours meet in a joint in the middle of their segment. So node i is the middle
@@ -25,6 +23,7 @@ if TYPE_CHECKING:
     import mujoco
 
 GRAVITY = 9.81
+SCALAR_LAST = np.array([1, 2, 3, 0])  # MuJoCo's w comes first, scipy's last
 ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
 NODE_PREFIX = 'node'
 REST_SPEED = 1e-4
@@ -55,8 +54,8 @@ def build_spec(
     """
     Build the model before compilation.
 
-    `scene` gives the convex pieces to collide with, None the empty space; `supported` lets
-    something else carry the rod's weight.
+    scene: gives the convex pieces to collide with; None is empty space. supported: something else
+    carries the rod's weight.
     """
     mujoco = require('mujoco', 'simulate')
 
@@ -89,11 +88,7 @@ def build_model(
     profile: str = 'live',
     supported: bool = False,
 ) -> mujoco.MjModel:
-    """
-    Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip.
-
-    Raises SettingsError.
-    """
+    """Compile `build_spec`; bodies `node0` ... `nodeN` are the links. Raises SettingsError."""
     spec = build_spec(robot, plant, scene, profile, supported)
     try:
         return spec.compile()
@@ -132,8 +127,8 @@ def _add_twist_torque(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """
     excess = model.jnt_user[:, 0]
     joints = np.flatnonzero(excess)
-    quat = data.qpos[model.jnt_qposadr[joints, None] + np.arange(4)]
-    w = Rotation.from_quat(quat, scalar_first=True).as_rotvec()
+    quat = data.qpos[model.jnt_qposadr[joints, None] + SCALAR_LAST]
+    w = Rotation.from_quat(quat).as_rotvec()
     lever = np.stack([np.ones(len(joints)), -w[:, 2] / 2.0, w[:, 1] / 2.0], axis=1)
     torque = (excess[joints] * w[:, 0])[:, None] * lever
     data.qfrc_applied[model.jnt_dofadr[joints, None] + np.arange(3)] = torque
@@ -178,7 +173,7 @@ def uniform_rod(
     """
     Make a plain rod along x, clamped at the origin, for comparison with mechanics.
 
-    GJ: None is that of the ball joints alone, EI.
+    Without GJ it has that of the ball joints alone, EI.
 
     Its last body, `tip`, has no mass and lies at the rod's end: loads go there.
     """
@@ -201,11 +196,7 @@ def uniform_rod(
 
 
 def _check_step(plant: PlantSettings, time_step: float) -> None:
-    """
-    Check that the time step is stable: omega * step < 2 of the insertion drive.
-
-    It alone stays explicit; joint springs are implicit.
-    """
+    """Check omega * step < 2 of the insertion drive, which alone is stepped explicitly."""
     omega = np.sqrt(plant.carriage_stiffness / plant.carriage_mass)
     if omega * time_step > 1.0:
         raise SettingsError(
@@ -230,14 +221,10 @@ def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndar
 
 
 def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
-    """
-    Add the body that the rod's first node is fixed to.
-
-    On its insertion slide where the base can travel.
-    """
+    """Add the body that the first node is fixed to, on a slide where the base can travel."""
     mujoco = require('mujoco', 'simulate')
 
-    quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
+    quat = np.roll(Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(), 1)
     carriage = spec.worldbody.add_body(name='carriage', pos=robot.base.xyz, quat=quat)
     if robot.base.insertion.mode != 'fixed':
         carriage.add_joint(
@@ -290,11 +277,7 @@ def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
 def _add_link(
     body, robot: RobotDescription, plant: PlantSettings, back: float, forth: float
 ) -> None:
-    """
-    Add a link from -back to +forth of the node.
-
-    The inertia of a solid cylinder, and the capsule that touches the scene.
-    """
+    """Add a link from -back to +forth of the node, a solid cylinder that touches as a capsule."""
     import mujoco
 
     length, centre = back + forth, (forth - back) / 2.0
@@ -323,9 +306,7 @@ def _add_link(
 
 def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
     """
-    Thread each tendon through a channel in every link up to its module's end.
-
-    Its actuator pulls with ctrl newtons.
+    Thread each tendon through every link up to its module's end; its actuator pulls ctrl newtons.
 
     A channel opens at GUIDE / 2 of a segment from each joint. Its straight stretch across the
     joint has the moment arm r cos(phi / 2) + GUIDE h / 2 sin(phi / 2): short stretches keep the
@@ -381,11 +362,7 @@ def _add_scene(spec, robot: RobotDescription, plant: PlantSettings, scene) -> No
 
 
 def _reachable(robot: RobotDescription, vertices: np.ndarray) -> bool:
-    """
-    Whether a piece's bounding box meets the reach of the rod over its whole insertion.
-
-    The reach is shaped like a capsule.
-    """
+    """Whether a piece's bounding box meets the capsule that the rod may reach."""
     T = robot.base.T_map_base
     travel = np.linspace(*robot.base.insertion.range, 8)
     origins = T[:3, 3] + travel[:, None] * T[:3, 0]

@@ -37,9 +37,7 @@ class Command:
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
     """
-    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m.
-
-    They are held before the first and after the last.
+    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; the first and last are held.
 
     supported: the arm lies in a groove that carries its weight.
     """
@@ -146,11 +144,7 @@ class Keyframe(Settings):
 
 
 class TrajectoryFile(Settings):
-    """
-    A trajectory of your own, as YAML.
-
-    `keyframes`, and whether the arm is `supported` against gravity.
-    """
+    """A trajectory of your own, as YAML: `keyframes`, and whether the arm is `supported`."""
 
     keyframes: tuple[Keyframe, ...] = Field(min_length=2)
     supported: bool = False
@@ -231,9 +225,7 @@ def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
 
 def _level_moments(robot: RobotDescription, plant: PlantSettings) -> np.ndarray:
     """
-    (G, 2) bending moments whose mean holds a level rod against its own weight.
-
-    They are constant in each module.
+    (G, 2) bending moments, one for each module, whose mean holds a level rod against its weight.
 
     A cantilever's moment is w (L - s)^2 / 2; the mean over [a, b] is w ((L - a)^3 - (L - b)^3) /
     (6 (b - a)).
@@ -424,11 +416,7 @@ def _free(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
 
 
 def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
-    """
-    From straight into the groove within three seconds, then still.
-
-    Uniform moment bends a uniform rod to an arc.
-    """
+    """From straight into the groove within three seconds by a uniform moment, then still."""
     curvature = _GROOVES[name] * np.array([0.0, 1.0, 1.0])
     moments = plant.EI * np.stack([curvature, np.zeros(3)], axis=-1)[:, None, :]
     times = np.array([REST, REST + 3.0, REST + 9.0])

@@ -1,7 +1,5 @@
 """
-The simulated world.
-
-A robot in a scene, driven along a trajectory, and every sensor's samples with the truth.
+The simulated world: a robot driven through a scene, its samples, and the truth.
 
     world = World(load_robot("engine"), load_scene("S0"), "t1")
     for sample in world.run(20.0):
@@ -121,9 +119,7 @@ class World:
 
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
         """
-        Yield samples of the first `duration` seconds, in the order of their stamps.
-
-        The default is the trajectory's duration.
+        Yield the samples of `duration` seconds (None: the trajectory's), by their stamps.
 
         Every call starts again from rest. Raises SettingsError for a duration that is none, and
         model.SimulationDiverged.
@@ -333,11 +329,7 @@ class _Body:
             self.data.qpos[0] = self.data.ctrl[0]
 
     def settle(self) -> None:
-        """
-        Bring the robot to rest under the first command, from straight.
-
-        Time 0 is then the trajectory's start.
-        """
+        """Bring the robot from straight to rest under the trajectory's first command."""
         self._start_straight()
         settle(self.model, self.data)
         self.data.time = 0.0
@@ -357,9 +349,7 @@ class _Body:
 
     def step(self) -> State:
         """
-        Return the state at the next step's beginning; then take the step.
-
-        Before it is taken, the drives' new command acts.
+        Return the state at the next step's beginning; then set the drives and take the step.
 
         MuJoCo's derived quantities after a step still belong to its beginning, so no extra
         kinematics are needed.

@@ -17,6 +17,7 @@ from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.readings import travel_cause
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import EncoderSample, TrackedPose
+from continuum_loc.robot import Insertion
 import numpy as np
 
 FIT_SQUARED = 27.9  # chi-squared of six degrees of freedom at 1e-4
@@ -111,6 +112,23 @@ class TrackerFactor(_PoseFactor):
         return Row(number, node, measurement.T_map_sensor @ T_sensor_ring, information)
 
 
+def travel_of(measurement: EncoderSample, insertion: Insertion) -> float:
+    """Read the travel of the base [m]. Raises MeasurementError where it cannot be used."""
+    if insertion.mode != 'measured':
+        raise MeasurementError(
+            'not used', f"insertion is '{insertion.mode}' in the robot description"
+        )
+    if 'insertion' not in measurement.names:
+        raise MeasurementError(
+            'not used', f"no joint 'insertion' among {', '.join(measurement.names)}"
+        )
+    travel = float(measurement.position[measurement.names.index('insertion')])
+    require_finite(np.array(travel), 'insertion', 'joint_states')
+    if beyond := travel_cause(travel, insertion.range):
+        raise MeasurementError('beyond range', f"joint 'insertion' {beyond}")
+    return travel
+
+
 class InsertionFactor(_PoseFactor):
     """Base travel along its own x axis, from the joint state `insertion`."""
 
@@ -121,27 +139,24 @@ class InsertionFactor(_PoseFactor):
         super().__init__(setup, ['insertion'])
 
     def row(self, measurement: EncoderSample) -> Row:
-        insertion = self.robot.base.insertion
-        if insertion.mode != 'measured':
-            raise MeasurementError(
-                'not used', f"insertion is '{insertion.mode}' in the robot description"
-            )
-        if 'insertion' not in measurement.names:
-            raise MeasurementError(
-                'not used', f"no joint 'insertion' among {', '.join(measurement.names)}"
-            )
-        travel = float(measurement.position[measurement.names.index('insertion')])
-        require_finite(np.array(travel), 'insertion', 'joint_states')
-        if beyond := travel_cause(travel, insertion.range):
-            raise MeasurementError('beyond range', f"joint 'insertion' {beyond}")
+        base = self.robot.base
+        if base.mode == 'free':
+            raise MeasurementError('not used', 'nobody knows what a free base travels from')
+        insertion = base.insertion
+        travel = travel_of(measurement, insertion)
         T_map_base = self.robot.base.T_map_base.copy()
         T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
         information[0, 0] = insertion.sigma**-2.0
         return Row(0, 0, T_map_base, information)
 
+    @classmethod
+    def wanted(cls, setup):
+        return setup.robot.base.mode != 'measured' and super().wanted(setup)
+
     def awaited(self):
-        return self.robot.base.insertion.mode == 'measured'
+        base = self.robot.base
+        return base.mode == 'fixed' and base.insertion.mode == 'measured'
 
     def guess(self, row, guess):
         guess.T_map_base = row.T_map_node
