@@ -21,6 +21,8 @@ from continuum_loc.estimator.state import Column, NODE_DIM
 from continuum_loc.estimator.window import Window
 import numpy as np
 
+ROTATION = np.arange(3, 6)  # of a node's state
+
 
 @dataclass(slots=True, eq=False)
 class Apart:
@@ -50,21 +52,22 @@ class Apart:
 
     def turns(self, k: int, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (m, 3, 3) of nodes (m,) over interval k, and their covariances [rad^2]."""
-        a, b = self.columns[k : k + 2]
+        a, b = self.columns[k], self.columns[k + 1]
         R = a.T[nodes, :3, :3].transpose(0, 2, 1) @ b.T[nodes, :3, :3]
-        A = np.zeros((3 * len(nodes), self.chain.dim))
+        A = np.zeros((len(nodes), 3, self.chain.dim))
         B = np.zeros_like(A)
         for i, node in enumerate(nodes):
-            rotation = slice(NODE_DIM * node + 3, NODE_DIM * node + 6)
-            A[3 * i : 3 * i + 3, rotation] = -R[i].T
-            B[3 * i : 3 * i + 3, rotation] = np.eye(3)
+            rotation = NODE_DIM * node + ROTATION
+            A[i][:, rotation] = -R[i].T
+            B[i][:, rotation] = np.eye(3)
+        A, B = A.reshape(-1, self.chain.dim), B.reshape(-1, self.chain.dim)
         return R, self.chain.covariance(k, A, B, size=3, step=3)
 
     def covariance(self, k: int, node: int, part: slice) -> np.ndarray:
         """Covariance of one part of a node's state in column k."""
-        at = NODE_DIM * node
-        A = np.zeros((part.stop - part.start, self.chain.dim))
-        A[:, at + part.start : at + part.stop] = np.eye(len(A))
+        rows = NODE_DIM * node + np.arange(NODE_DIM)[part]
+        A = np.zeros((len(rows), self.chain.dim))
+        A[np.arange(len(rows)), rows] = 1.0
         return self.chain.covariance(k, A)
 
 

@@ -42,7 +42,7 @@ class BendWatch(Comparison):
         self._samples.append((time, sample))
 
     def hear(self, interval: Interval, k: int, body: Apart, misfit: float) -> None:
-        a, b = body.columns[k : k + 2]
+        a, b = body.columns[k], body.columns[k + 1]
         samples = [(time, one) for time, one in self._samples if a.time < time <= b.time]
         if not samples:
             return
