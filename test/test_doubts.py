@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
-from continuum_loc.estimator.readings import range_cause, travel_cause
+from continuum_loc.estimator.readings import curvature_cause, range_cause, travel_cause
 from continuum_loc.estimator.turning import Ledger, Turn
 from continuum_loc.measurements import (
     ImuSample,
@@ -195,6 +195,17 @@ def test_an_encoder_beyond_its_range_is_told_with_the_likely_unit():
     assert travel_cause(25.0, limits).endswith('centimetres?')
     assert travel_cause(1.3, limits) == 'reads 1.3 m, beyond its range of 0 to 0.6 m'
     assert travel_cause(-5e4, limits).endswith('0.6 m')
+
+
+def test_curvature_that_no_body_has_is_told_from_the_reading_alone():
+    """A body of 2 cm bends about no point within itself: 50 1/m; noise of 0.01 1/m is not 10."""
+    rng = np.random.default_rng(0)
+    bent = np.linspace(0.1, 0.9, 20) + SIGMA * rng.normal(size=(8, 20))
+    straight = SIGMA * rng.normal(size=(8, 20))
+    assert curvature_cause(bent, SIGMA, 0.02) == '' == curvature_cause(straight, SIGMA, 0.02)
+    assert '1000 times' in curvature_cause(1e3 * bent[:1], SIGMA, 0.02)
+    assert '1000 times' in curvature_cause(1e3 * straight, SIGMA, 0.02)
+    assert curvature_cause(1e3 * straight[:1], SIGMA, 0.02) == ''  # one sample has no noise
 
 
 def test_ranges_in_millimetres_are_told():

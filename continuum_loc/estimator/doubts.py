@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
+from continuum_loc.estimator.base_watch import BaseWatch
 from continuum_loc.estimator.bending import BendWatch
 from continuum_loc.estimator.explain import explanations, Round, Stretch
 from continuum_loc.estimator.factors import Factor, Setup
 from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, share_by_factor
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.readings import range_cause, travel_cause
+from continuum_loc.estimator.readings import curvature_cause, range_cause, travel_cause
 from continuum_loc.estimator.settings import DoubtSettings
 from continuum_loc.estimator.turning import TurnWatch
 from continuum_loc.estimator.window import Window
@@ -39,6 +40,7 @@ BACKOFF_LIMIT = 16.0  # [s] longest time between two rounds without a finding
 ENOUGH = 0.4  # [s] of data before anything is said
 NOISE_SAMPLES = 40  # of a gyro, whose noise tells its unit
 BADLY = 1.5  # times what makes all doubtful: one factor alone may be off by more
+CURVATURES = 8  # newest samples of the strain, whose noise tells its unit
 MOST = 0.7  # of a kind's samples have to fit, whatever else does
 LOW_SHARE = 0.6  # of a sensor's fitting samples: somebody is wrong
 BLIND = 'no usable zone'
@@ -65,7 +67,9 @@ class Doubts:
         named = {factor.name for factor in factors}
         self._turns, self._bends = watches(setup, factors)
         self._comparisons = deque(one for one in (self._turns, self._bends) if one)
+        self._curvature: deque[np.ndarray] = deque(maxlen=CURVATURES)
         self._noise: dict[str, deque[np.ndarray]] = {}
+        self._base = BaseWatch(setup, window)
         self._off = False  # the window does not fit, and no round of explanations has been yet
         self._next_round, self._backoff, self._next_reading = 0.0, 1.0, 0.0
         self._unused = self._is_unused(setup)
@@ -78,6 +82,7 @@ class Doubts:
             return
         if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
+            self._base.note(measurement, time)
         self._read_at_once(measurement, time)
 
     def _read_at_once(self, measurement: Measurement, time: float) -> None:
@@ -86,8 +91,6 @@ class Doubts:
         if isinstance(measurement, ImuSample) and self._turns:
             kept = self._noise.setdefault(measurement.sensor, deque(maxlen=NOISE_SAMPLES))
             kept.append(measurement.angular_velocity)
-        if isinstance(measurement, StrainSample) and self._bends:
-            self._bends.note(time, measurement)
         if isinstance(measurement, TofFrame):
             cause = range_cause(measurement.ranges, robot.tof_model.max_range)
             if cause:
@@ -99,6 +102,17 @@ class Doubts:
             if cause and insertion.mode == 'measured' and np.isfinite(travel):
                 self._tell(('insertion',), cause, time)
 
+    def _hear_strain(self, measurement: StrainSample, time: float) -> None:
+        """Keep a sample for its comparison, and judge whether any body bends so."""
+        if self._bends:
+            self._bends.note(time, measurement)
+        self._curvature.append(measurement.kappa)
+        alike = [one for one in self._curvature if one.shape == measurement.kappa.shape]
+        robot = self._setup.robot
+        cause = curvature_cause(np.array(alike), robot.strain.kappa_sigma, robot.radius)
+        if cause:
+            self._tell(('strain',), cause, time)
+
     @property
     def pending(self) -> bool:
         """Whether an explanation is looked for, before which nobody else is accused."""
@@ -109,6 +123,8 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
+        for name, cause in self._base.causes(time).items():
+            self._tell((name,), cause, time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time)

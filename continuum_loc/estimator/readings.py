@@ -15,11 +15,9 @@ import numpy as np
 DEGREES = 180.0 / np.pi
 TRAVEL_SLACK = 0.02  # [m] that an encoder may read beyond the described range
 LENGTHS = {'millimetres': 1e-3, 'centimetres': 1e-2}
+TOO_NOISY = 100.0  # times the noise described: no motion is that fast
+TOO_CURVED = 'curvature 1000 times too large?'
 BEYOND = 10.0  # times its reach: no sensor is that far off
-BETTER = 4.0  # times: how much smaller the squares have to be with a cause than without
-MISFIT = 4.0  # squared error of a reading over its noise's from which a cause is looked for
-EXPLAINED = 0.7  # share of what is read that a cause has to account for
-EXCITED = 9.0  # squared motion over the noise's, below which nothing can be told
 
 
 def travel_cause(travel: float, limits: tuple[float, float]) -> str:
@@ -40,6 +38,22 @@ def range_cause(ranges: np.ndarray, max_range: float) -> str:
     if len(read) < 10 or np.median(read) < BEYOND * max_range:
         return ''
     return f'reads {np.median(read):.4g} m where {max_range:g} m is its reach: millimetres?'
+
+
+def curvature_cause(kappa: np.ndarray, sigma: float, radius: float) -> str:
+    """
+    Say that a strain sensor reads what no body does, or ''.
+
+    kappa: (K, M) newest samples at M stations [1/m]; sigma: of a reading [1/m]; radius: of the
+    body [m], which cannot bend about a point within itself. Noise far above the one described
+    tells the unit while the body is straight.
+    """
+    if np.median(np.abs(kappa[-1])) * radius > 1.0:
+        return TOO_CURVED
+    if len(kappa) < 4:
+        return ''
+    noise = np.median(np.std(np.diff(kappa, axis=0), axis=0)) / 2**0.5
+    return TOO_CURVED if noise > TOO_NOISY * sigma else ''
 
 
 def bending_read(theta: np.ndarray, kappa: np.ndarray) -> np.ndarray:
@@ -78,7 +92,7 @@ GYRO_CAUSES = [
 STRAIN_CAUSES = {
     'curvature 1000 times too small: 1/mm?': lambda theta, kappa: (theta, 1e3 * kappa),
     'curvature 100 times too small: 1/cm?': lambda theta, kappa: (theta, 1e2 * kappa),
-    'curvature 1000 times too large?': lambda theta, kappa: (theta, 1e-3 * kappa),
+    TOO_CURVED: lambda theta, kappa: (theta, 1e-3 * kappa),
     'angle in degrees?': lambda theta, kappa: (theta / DEGREES, kappa),
     'angle converted to radians twice?': lambda theta, kappa: (theta * DEGREES, kappa),
     'angle of the other sign?': lambda theta, kappa: (-theta, kappa),
