@@ -174,7 +174,7 @@ class Base(Settings):
         (0.3, 0.5), description='how fast a carried base moves and turns, 1 sigma [m/s, rad/s]'
     )
     acceleration: tuple[float, float] = Field(
-        (0.02, 0.05),
+        (0.01, 0.03),
         description='white noise on the acceleration of a carried base [m^2/s^3, rad^2/s^3]',
     )
 

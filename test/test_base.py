@@ -1,9 +1,11 @@
 """A base that is carried: what its measurement weighs, and what a body that moves as one costs."""
 
+from heapq import merge
+
 from continuum_loc import lie
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
 from continuum_loc.estimator.factors import FACTORS, Setup
-from continuum_loc.estimator.normal import Normal
+from continuum_loc.estimator.normal import Normal, symmetric
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import column_at_rest, Grid
 from continuum_loc.measurements import (
@@ -19,6 +21,7 @@ import pytest
 from worlds import EPOCH, Rod, rod, room_map, stream
 
 DT = 0.1
+SPREAD = np.array([0.0005] * 3 + [np.radians(0.1)] * 3)  # of a base, as descriptions have it
 LOOSE = parse_settings(EstimatorSettings, {'base': {'cauchy': 1e6}})
 
 
@@ -244,3 +247,57 @@ def test_a_frame_that_drifts_is_found(prior_map):
     off = lie.inverse(column.T[0]) @ column.T_map_frame[0] @ error(column.time) @ column.T[0]
     assert np.linalg.norm(off[:3, 3]) < 0.003
     assert np.degrees(np.linalg.norm(lie.log(off)[3:])) < 0.3
+
+
+def test_a_base_said_to_be_fixed_that_moves_is_told_and_let_go(prior_map):
+    robot = carried('fixed')
+    kept = (
+        one for one in carried_stream(CarriedRod(robot), 4.0) if not isinstance(one, BaseSample)
+    )
+    _, estimates, errors, _ = run(robot, kept, prior_map)
+    off = [
+        np.linalg.norm(lie.log(CarriedRod(robot).base((one.stamp - EPOCH) / 1e9)) / SPREAD)
+        for one in estimates
+    ]
+    moved = next(one.stamp for one, far in zip(estimates, off, strict=True) if far > 10.0)
+    told = next(one.stamp for one in estimates if one.doubts and one.doubts[0][:4] == 'base')
+    assert told - moved < nanoseconds(0.5)
+    after = [k for k, one in enumerate(estimates) if one.stamp > told + nanoseconds(0.5)]
+    assert errors[after][:, 1:].mean() < 0.003
+    assert {estimates[k].status for k in after} == {'doubtful'}
+
+
+def test_an_encoder_off_by_3_cm_is_named_and_the_base_is_not(prior_map):
+    insertion = {'mode': 'measured', 'range': [-0.2, 0.2], 'sigma': 0.0005}
+    robot = carried('fixed', insertion=insertion)
+    samples = stream(Rod(robot), 2.0)
+    encoder = (
+        EncoderSample(EPOCH + nanoseconds(0.02 * k), ('insertion',), np.array([x]), np.zeros(1))
+        for k, x in enumerate([0.0] * 50 + [0.03] * 50)
+    )
+    _, estimates, errors, _ = run(robot, merge(samples, encoder, key=stamp_of), prior_map)
+    named = {name for one in estimates for name in one.suspects}
+    assert named == {'insertion'}
+    assert 'contradicts the rest (30 mm off)' in {
+        one.suspects.get('insertion') for one in estimates
+    }
+    assert errors[-10:].mean() < 0.002
+
+
+def stamp_of(sample) -> int:
+    return sample.stamp
+
+
+@pytest.mark.parametrize('shift, weight', [(0.002, 1.0), (0.02, 100.0 / 1600.0)])
+def test_the_prior_of_a_base_is_let_go_beyond_its_spread(shift, weight):
+    """20 mm are 40 sigmas of 0.5 mm: 100 / 40^2 of the weight is left; 2 mm are 4, and all is."""
+    robot = carried('fixed')
+    grid = Grid(robot, 0.16)
+    priors = Priors(robot, grid, EstimatorSettings())
+    T_map_base, rest = np.eye(4), np.tile([1.0, 0, 0, 0, 0, 0], (grid.nodes, 1))
+    T_map_base[1, 3] = shift
+    moved = column_at_rest(grid, T_map_base, rest, 0.0)
+    found = symmetric(priors.start(moved).H)
+    still = symmetric(priors.start(column_at_rest(grid, np.eye(4), rest, 0.0)).H)
+    expected = 0.0005**-2.0 * (weight - 1.0)
+    assert (found - still)[1, 1] == pytest.approx(expected, rel=1e-6, abs=1.0)

@@ -64,6 +64,7 @@ class SlidingWindowFilter:
         """Forget everything but the counts; the next measurement starts anew."""
         self.epoch: int | None = None
         self.newest: int = 0
+        self.priors.let_go(False)
         self.factors = [kind(self.setup) for kind in FACTORS if kind.wanted(self.setup)]
         self._factors_of: dict[type, list[Factor]] = {}
         awaited = [one.consumes for one in self.factors if one.awaited()]
@@ -215,6 +216,8 @@ class SlidingWindowFilter:
         self._rest.finish(self.window, time)
         self.doubts.look(time, self.epoch)
         self.health.hear_of(self.doubts)
+        if self.priors.let_go('base' in self.doubts.causes):
+            self.window.mark_changed()
         self.recovery.look_after(time, outcome[1])
         self.history.note(self.window)
         return outcome

@@ -33,6 +33,8 @@ import numpy as np
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
 BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
 MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in motion
+LET_GO = 1e-6  # of the information on a fixed base that is found to be elsewhere
+BASE_PLAIN = 100.0  # ten sigmas: a body that is swung pulls its base by several
 ANYWHERE = (10.0, 3.0)  # [m, rad] spread of a base of which nothing is known but its measurement
 ASTRAY = (0.1, 0.2)  # [m, rad] spread about where a carried base, or its frame, was last
 STEADY = (1e-4, 1e-4)  # [m/sqrt(s), rad/sqrt(s)] drift of odometry at rest
@@ -94,12 +96,14 @@ class Priors:
         self.rest = np.array(robot.backbone.rest_strain)
         share = prior.velocity_at_base
         grown = share + (1.0 - share) * (grid.s / grid.s[-1]) ** 2
-        self.velocity_psd = grown[:, None] * np.array(prior.velocity) + _carried(robot, grid)
+        self._held_psd = grown[:, None] * np.array(prior.velocity)
+        self._carried_psd = self._held_psd + _carried(robot, grid)
+        self._carried = robot.base.mode != 'fixed'
+        self.velocity_psd = self._carried_psd if self._carried else self._held_psd
         self.inverse_strain_rate_psd = 1.0 / np.array(prior.strain_rate)
         step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
         self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
-        self.T_map_base, base_information = _base_of(robot)
-        self._carried = robot.base.mode != 'fixed'
+        self.T_map_base, self._base_information = _base_of(robot)
         self._drifts = robot.base.measurement.drift > 0.0
         self._own_frame = self._drifts or robot.base.measurement.frame != 'map'
         self._of_frame, self._of_start = _frame_of(robot), _start_of(robot)
@@ -120,8 +124,22 @@ class Priors:
             self.rest,
             1.0 / np.square(robot.backbone.rest_strain_sigma),
             self.T_map_base,
-            base_information,
+            self._base_information,
         )
+
+    def let_go(self, loose: bool) -> bool:
+        """
+        Take a fixed base for one that is carried, or believe it again; True if that is new.
+
+        For a base of which it was found that it is not where it is said to be.
+        """
+        if self._carried or loose == (self.velocity_psd is self._carried_psd):
+            return False
+        self.velocity_psd = self._carried_psd if loose else self._held_psd
+        self._in_time = self._in_time._replace(inverse_velocity_psd=1.0 / self.velocity_psd)
+        information = LET_GO * self._base_information if loose else self._base_information
+        self._of_column = self._of_column._replace(base_information=information)
+        return True
 
     def start(
         self,
@@ -183,9 +201,6 @@ class Priors:
 def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
     """Pose of the base in the middle of its travel, and `OfColumn.base_information`."""
     base, insertion = robot.base, robot.base.insertion
-    if base.mode != 'fixed':
-        rate = np.repeat(np.square(base.speed), 3)
-        return base.T_map_base, np.stack([np.zeros(6), 1.0 / rate])
     middle = 0.0 if insertion.mode == 'fixed' else float(np.mean(insertion.range))
     sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
     rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
@@ -193,13 +208,14 @@ def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
         sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
         rate[0] = 1.0
     along = lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
+    if base.mode != 'fixed':
+        rate = np.repeat(np.square(base.speed), 3)
+        return base.T_map_base @ along, np.stack([np.zeros(6), 1.0 / rate])
     return base.T_map_base @ along, np.stack([sigma**-2.0, rate**-2.0])
 
 
 def _carried(robot: RobotDescription, grid: Grid) -> np.ndarray:
     """(N, 6) process noise of nodes that are carried along by their base, as if straight."""
-    if robot.base.mode == 'fixed':
-        return np.zeros((grid.nodes, 6))
     shift, turn = robot.base.acceleration
     psd = np.empty((grid.nodes, 6))
     psd[:, 0], psd[:, 3:] = shift, turn
@@ -219,7 +235,9 @@ def _loosely(spread: tuple[float, float]) -> np.ndarray:
 
 def _start_of(robot: RobotDescription) -> OfStart:
     """Make `OfStart`: a free base is known by its description, a measured one by its frame."""
-    known = 1.0 / _lasting(robot)
+    known, insertion = 1.0 / _lasting(robot), robot.base.insertion
+    if insertion.mode == 'unknown' and robot.base.mode == 'free':
+        known[0] = 1.0 / (1.0 / known[0] + np.ptp(insertion.range) ** 2)
     return OfStart(known if robot.base.mode == 'free' else _loosely(ANYWHERE), known)
 
 
@@ -389,14 +407,26 @@ def _add_space(normal, column, prior, share, work):
 
 @kernel
 def _add_base(normal, column, prior, share, work):
-    """Add the base's pose and velocity; the squared error."""
+    """
+    Add the base's pose and velocity; twice their cost.
+
+    A base that all the rest has far from where it should be is let go: a square up to BASE_PLAIN,
+    and its logarithm beyond.
+    """
     at, velocity = work[0], column.velocity[0]
     lie_kernels.pose_error(prior.T_map_base, column.T[0], at.xi, at.right, at.scratch)
     error, J, squared = at.xi.x, at.right, 0.0
     for i in range(6):
+        information = prior.base_information[0, i]
+        rate = prior.base_information[1, i]
+        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
+    if squared > BASE_PLAIN:
+        share *= BASE_PLAIN / squared
+        squared *= 1.0 + np.log(squared / BASE_PLAIN)
+    cost = share * squared
+    for i in range(6):
         information = prior.base_information[0, i] * share
         rate = prior.base_information[1, i] * share
-        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
         for j in range(6):
             weighted = information * J[i, j]
             normal.g[j] += weighted * error[i]
@@ -404,4 +434,4 @@ def _add_base(normal, column, prior, share, work):
                 normal.H[j, k] += weighted * J[i, k]
         normal.H[VELOCITY + i, VELOCITY + i] += rate
         normal.g[VELOCITY + i] += rate * velocity[i]
-    return squared
+    return cost

@@ -45,7 +45,8 @@ class Suspicion:
         """Take the next estimate: its suspects have been that since the one before."""
         step, self._last = estimate.stamp - self._last, estimate.stamp
         for name, reason in estimate.suspects.items():
-            kind = re.sub(r'\d+ ms ', '', reason)  # how late it is changes from step to step
+            # How late or how far off it is changes from step to step.
+            kind = re.sub(r'\d+ ms | \(.*\)', '', reason)
             self._seconds[name][kind] += step / NANOSECONDS if 0 < step <= LONGEST_STEP else 0.0
 
     def table(self) -> dict[str, dict[str, float]]:

@@ -10,6 +10,7 @@ show.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from scipy.interpolate import PchipInterpolator
 
 REST = 1.0  # seconds at rest at the start
 GRAVITY = 9.81
+LEVELLED = 0.25  # [s] between keyframes of a trajectory that follows a rolled base
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,6 +223,30 @@ def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
         plant.tension_for_moments(moments),
         np.array([row[1] for row in rows]),
     )
+
+
+def levelled(
+    name: str, robot: RobotDescription, plant: PlantSettings, roll: Callable[[float], float]
+) -> Drive:
+    """
+    Make a trajectory of the engine robot whose base is rolled by `roll` (time [s]) [rad].
+
+    The moments stay as they are in `map`: a robot that is held level must not sag aside because
+    its base is turned about it.
+    """
+    if name not in _ENGINE or len(plant.tendons) != len(_ENGINE[name][0]) - 2:
+        raise SettingsError(f"no trajectory '{name}' of robot '{robot.name}' for a rolled base")
+    rows = _ENGINE[name]
+    keys = np.array([row[0] for row in rows])
+    curvature = PchipInterpolator(keys, np.array([row[2:] for row in rows]))
+    times = np.arange(keys[0], keys[-1] + 1e-9, LEVELLED)
+    moments = plant.EI * curvature(times) + _level_moments(robot, plant)
+    angle = np.array([roll(time) for time in times])
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    y, z = moments[..., 0], moments[..., 1]
+    turned = np.stack([cos * y + sin * z, cos * z - sin * y], axis=-1)
+    insertion = PchipInterpolator(keys, np.array([row[1] for row in rows]))(times)
+    return Drive(name, times, plant.tension_for_moments(turned), insertion)
 
 
 def _level_moments(robot: RobotDescription, plant: PlantSettings) -> np.ndarray:

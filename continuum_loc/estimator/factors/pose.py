@@ -42,16 +42,22 @@ class Batch(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """Scale of the robust loss, what each of S sensors counts by, and its [usable, fitting]."""
+    """
+    Scale of the robust loss, what each of S sensors counts by, and its [usable, fitting].
+
+    plain: squared error up to which the loss is a square.
+    """
 
     cauchy: float
+    plain: float
     weights: np.ndarray
     fits: np.ndarray
 
 
 class _PoseFactor(Factor):
     batch = Batch
-    cauchy = np.inf
+    cauchy: float
+    plain = 0.0
 
     def stack(self, times, rows):
         order = np.argsort([row.node for row in rows], kind='stable')  # node by node
@@ -59,15 +65,10 @@ class _PoseFactor(Factor):
 
     def linearise(self, batch, a, b, normal):
         fits = np.zeros((len(self.sensors), 2))
-        loss = Loss(self.cauchy, self.weights, fits)
+        loss = Loss(self.cauchy, self.plain, self.weights, fits)
         cost, squared = _add(normal, a, b, batch, loss, self._work)
         observed = np.diagonal(batch.information, axis1=1, axis2=2) > 0.0
-        told = fits if self.robust else None
-        return FactorReport(cost, squared, int(np.sum(observed)), told)
-
-    @property
-    def robust(self) -> bool:
-        return bool(np.isfinite(self.cauchy))
+        return FactorReport(cost, squared, int(np.sum(observed)), fits)
 
     def weigh(self, doubted, weight):
         # A pose says all of its node at once, and an encoder has no loss: 5 % would be too much.
@@ -134,20 +135,21 @@ class InsertionFactor(_PoseFactor):
 
     name = 'insertion'
     consumes = EncoderSample
+    cauchy = 2.0  # an encoder that all the rest contradicts is let go, one within 5 sigma is not
+    plain = 9.0
 
     def __init__(self, setup):
         super().__init__(setup, ['insertion'])
 
     def row(self, measurement: EncoderSample) -> Row:
         base = self.robot.base
-        if base.mode == 'free':
-            raise MeasurementError('not used', 'nobody knows what a free base travels from')
         insertion = base.insertion
         travel = travel_of(measurement, insertion)
         T_map_base = self.robot.base.T_map_base.copy()
         T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
-        information[0, 0] = insertion.sigma**-2.0
+        if base.mode == 'fixed':  # what a free one travels from is known at the start alone
+            information[0, 0] = insertion.sigma**-2.0
         return Row(0, 0, T_map_base, information)
 
     @classmethod
@@ -155,8 +157,7 @@ class InsertionFactor(_PoseFactor):
         return setup.robot.base.mode != 'measured' and super().wanted(setup)
 
     def awaited(self):
-        base = self.robot.base
-        return base.mode == 'fixed' and base.insertion.mode == 'measured'
+        return self.robot.base.insertion.mode == 'measured'
 
     def guess(self, row, guess):
         guess.T_map_base = row.T_map_node
@@ -176,7 +177,7 @@ def _add(normal, a, b, batch, loss, work):
         gp.evaluate(work, batch.times[m], True, 6)
         sensor = batch.sensors[m]
         weight = loss.weights[sensor]
-        u2, robust = _local(work, batch.T_map_node[m], batch.information[m], c2, local)
+        u2, robust = _local(work, batch.T_map_node[m], batch.information[m], loss, local)
         for i in range(6):
             local.g[i] *= weight
             for j in range(6):
@@ -188,14 +189,14 @@ def _add(normal, a, b, batch, loss, work):
         if m + 1 == batch.times.shape[0] or batch.nodes[m + 1] != n:
             rows_in_time(n, normal.g.shape[0] // 2, index)
             scatter(normal, index, total, 1.0)
-        own = 0.5 * u2 if np.isinf(loss.cauchy) else 0.5 * c2 * np.log1p(u2 / c2)
+        own = 0.5 * min(u2, loss.plain) + 0.5 * c2 * np.log1p(max(u2 - loss.plain, 0.0) / c2)
         cost += weight * own
         squared += u2 * robust
     return cost, squared
 
 
 @kernel
-def _local(work, T_measured, information, c2, local):
+def _local(work, T_measured, information, loss, local):
     """Write one pose's normal equations in its own frame; its squared error, and its weight."""
     at = work[0]
     gamma, J, scratch = at.gamma, at.right_gamma, at.scratch
@@ -205,7 +206,7 @@ def _local(work, T_measured, information, c2, local):
     u2 = 0.0
     for i in range(6):
         u2 += gamma.x[i] * weighted[i]
-    robust = 1.0 / (1.0 + u2 / c2)
+    robust = 1.0 / (1.0 + max(u2 - loss.plain, 0.0) / (loss.cauchy * loss.cauchy))
     lie_kernels.product(information, J, by_error)
     for i in range(6):
         local.g[i] = 0.0
