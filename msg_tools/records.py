@@ -48,6 +48,16 @@ class FrameRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TwistRecord:
+    """`ring_twist/<ring>`: body velocity (6,) [v; w] in the ring's own frame, and (6, 6)."""
+
+    stamp: int
+    frame: str
+    velocity: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CloudRecord:
     """
     `reconstruction` or `prior_map`: one (N,) array per field of the cloud.

@@ -31,19 +31,22 @@ class ShapeNode(WorkerNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('shape', ShapeNodeSettings(), **options)
         self.check_parameters()
+        self.estimator: ShapeEstimator | None = None
+        self.estimate: ShapeEstimate | None = None
+
+    def prepare(self) -> None:
+        """Compile the estimator, offer services and outputs."""
         chosen = (
             load_shape_settings(self.settings.settings)
             if self.settings.settings
             else ShapeSettings()
         )
-        self.estimator = ShapeEstimator(self.robot, chosen)
-        self.estimate: ShapeEstimate | None = None
+        self.estimator, self.estimate = ShapeEstimator(self.robot, chosen), None
         self.get_logger().info('compiling, or loading what an earlier run compiled')
         rehearse(self.robot, chosen)
         for topic in ('shape/poses', 'shape/curve'):
             self.publisher(topic)
-        self.create_service(Trigger, '~/reset', self._reset)
-        self.begin()
+        self.serve(Trigger, '~/reset', self._reset)
 
     def consume(self, measurement: Measurement) -> int | None:
         """One sample through the estimator; publish when an estimate fell due."""
@@ -80,7 +83,8 @@ class ShapeNode(WorkerNode):
 
     def summary(self) -> dict[str, Any]:
         """Add the estimator's own counts."""
-        return super().summary() | {'estimator': dict(self.estimator.counts)}
+        counts = dict(self.estimator.counts) if self.estimator else {}
+        return super().summary() | {'estimator': counts}
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.in_worker(self._start_over)
