@@ -80,7 +80,7 @@ def with_one_more(text):
         ('continuum_loc/robot.py', EVERYTHING),
         ('msg_tools/convert.py', EVERYTHING),
         ('continuum_loc/estimator/factors/tof.py', {'replay'} | STUDY),
-        ('continuum_loc/mapping/build.py', {'map'} | EVERYTHING),
+        ('continuum_loc/mapping/build.py', {'map', 'replay'} | STUDY),
         ('continuum_loc/formats/stl.py', {'scene of a mesh'} | EVERYTHING),
         ('continuum_loc/simulator/world.py', {'recording'} | STUDY),
         ('continuum_loc/simulator/cutting.py', {'recording', 'scene of a mesh'} | STUDY),

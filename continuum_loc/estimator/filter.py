@@ -64,9 +64,14 @@ class SlidingWindowFilter:
         """Forget everything but the counts; the next measurement starts anew."""
         self.epoch: int | None = None
         self.newest: int = 0
+        self.priors.let_go(False)
         self.factors = [kind(self.setup) for kind in FACTORS if kind.wanted(self.setup)]
         self._factors_of: dict[type, list[Factor]] = {}
-        self._awaited = {factor.consumes for factor in self.factors if factor.awaited()}
+        awaited = [one.consumes for one in self.factors if one.awaited()]
+        self._awaited = {
+            kind for one in awaited for kind in (one if type(one) is tuple else (one,))
+        }
+        self._needed = {one.needed() for one in self.factors if one.needed()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
         self.health = Health(self.robot, self.window, self.factors, self.settings.health)
@@ -137,6 +142,11 @@ class SlidingWindowFilter:
 
     def _admit(self, measurement: Measurement) -> bool:
         """Put the measurement into its interval; False where it was dropped and counted."""
+        if self._needed:
+            self._needed.discard(type(measurement))
+        if self._needed:
+            self.counts['dropped']['before the base was told'] += 1
+            return False
         if self.epoch is None:
             self._start(measurement.stamp)
         time = seconds(measurement.stamp, self.epoch)
@@ -166,6 +176,10 @@ class SlidingWindowFilter:
             row = factor.row(measurement)
         except MeasurementError as error:
             self.counts['dropped'][f'{factor.name}: {error.reason}'] += 1
+            return False
+        time -= factor.lateness(measurement)
+        if time < self.window.columns[0].time - TIME_EPSILON:
+            self.counts['dropped']['older than the window'] += 1
             return False
         self.window.interval_at(time).add(factor, time, row)
         return True
@@ -202,6 +216,8 @@ class SlidingWindowFilter:
         self._rest.finish(self.window, time)
         self.doubts.look(time, self.epoch)
         self.health.hear_of(self.doubts)
+        if self.priors.let_go('base' in self.doubts.causes):
+            self.window.mark_changed()
         self.recovery.look_after(time, outcome[1])
         self.history.note(self.window)
         return outcome
@@ -209,12 +225,19 @@ class SlidingWindowFilter:
     def _guess(self) -> None:
         """Start from what the first samples tell of base and shape; straight without them."""
         column = self.window.columns[0]
-        guess = Guess(column.T[0], column.strain.copy())
+        guess = Guess(column.T[0], column.strain.copy(), column.T_map_frame)
         for factor in self.factors:
             for row in self.window.intervals[-1].rows(factor)[:1]:
                 factor.guess(row, guess)
         self.window.place(
-            column_at_rest(self.grid, guess.T_map_base, guess.strain, column.time, column.bias)
+            column_at_rest(
+                self.grid,
+                guess.T_map_base,
+                guess.strain,
+                column.time,
+                column.bias,
+                guess.T_map_frame,
+            )
         )
 
     # ------------------------------------------------------------------ the output
@@ -257,6 +280,7 @@ class SlidingWindowFilter:
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
         covariance[:, :6, :6] += self._rattle_covariance(time, self.grid.s[rings])
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
+        T_map_frame, frame_covariance = self.window.frame(time)
         return Estimate(
             stamp=self.epoch + nanoseconds(time),
             T_map_ring=body.T[rings],
@@ -275,4 +299,6 @@ class SlidingWindowFilter:
             converged=outcome[1],
             step_seconds=clock.perf_counter() - started,
             lagged=lagged,
+            T_map_frame=T_map_frame,
+            frame_covariance=frame_covariance,
         )

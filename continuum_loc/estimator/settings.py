@@ -149,6 +149,13 @@ class TrackerSettings(Settings):
     cauchy: float = Field(4.0, gt=0.0, description='scale of the Cauchy loss in sigmas')
 
 
+class BaseSettings(Settings):
+    """Measured pose of a carried base."""
+
+    enabled: bool = True
+    cauchy: float = Field(4.0, gt=0.0, description='scale of the Cauchy loss in sigmas')
+
+
 class GravitySettings(Settings):
     """Accelerometer as gravity's direction, while the motion is quasi-static."""
 
@@ -338,6 +345,7 @@ class EstimatorSettings(Settings):
     gyro: GyroSettings = GyroSettings()
     strain: StrainSettings = StrainSettings()
     tracker: TrackerSettings = TrackerSettings()
+    base: BaseSettings = BaseSettings()
     gravity: GravitySettings = GravitySettings()
     field: FieldSettings = FieldSettings()
     mechanics: MechanicsSettings = MechanicsSettings()

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import ceil
 
+from continuum_loc import lie
 from continuum_loc.estimator.chain import Chain
 from continuum_loc.estimator.interpolation import (
     Body,
@@ -37,6 +38,7 @@ class Kept:
     chain: Chain
     pinned: bool
     moving: bool
+    first: Column
 
 
 class Window:
@@ -55,6 +57,8 @@ class Window:
         self.chain: Chain | None = None
         self.pinned = self._moving = False
         self._bias: tuple[np.ndarray, np.ndarray] | None = None
+        self._first: Column | None = None  # what the prior of the start is about
+        self.wandered = False  # once the body was found: what was known of its base is outdated
 
     def start(self, column: Column) -> None:
         """Begin with one column at rest."""
@@ -95,7 +99,7 @@ class Window:
 
         `moving` says that the body may be in motion there.
         """
-        self._moving, self.pinned = moving, False
+        self._moving, self.pinned, self._first = moving, False, self.columns[0]
         self.chain = Chain(self.grid.dim, self._start())
         self.mark_changed()
 
@@ -121,13 +125,14 @@ class Window:
             self.chain,
             self.pinned,
             self._moving,
+            self._first,
         )
 
     def restore(self, kept: Kept) -> None:
         """Go back to a snapshot; intervals were linearised elsewhere since, so solve again."""
         self.columns, self.offsets = list(kept.columns), list(kept.offsets)
         self.intervals, self.chain = list(kept.intervals), kept.chain
-        self.pinned, self._moving = kept.pinned, kept.moving
+        self.pinned, self._moving, self._first = kept.pinned, kept.moving, kept.first
         self.mark_changed()
 
     def place(self, shape: Column) -> None:
@@ -150,10 +155,10 @@ class Window:
         self.chain.marginals[0] = self._start()
 
     def _start(self) -> Normal:
-        start = self.priors.start(self.columns[0], self._moving)
+        start = self.priors.start(self.columns[0], self._first, self._moving, self.wandered)
         if self._bias is not None:
             weight, mean = self._bias
-            at = np.arange(self.grid.bias_offset, self.grid.dim)
+            at = np.arange(self.grid.bias_offset, self.grid.frame_offset)
             start.H[at, at] += weight
             start.g[at] += weight * (self.columns[0].bias.ravel() - mean)
         return start
@@ -167,6 +172,18 @@ class Window:
         """All nodes at `time` in the window."""
         k = self.knot_before(time)
         return body_between(self.column(k), self.column(k + 1), time)
+
+    def frame(self, time: float) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Pose (4, 4) and covariance (6, 6) of a measured base's frame at `time` in the window."""
+        if not self.grid.frames:
+            return None, None
+        k = self.knot_before(time)
+        a, b = self.column(k), self.column(k + 1)
+        u = (time - a.time) / (b.time - a.time)
+        J = np.zeros((6, self.grid.dim))
+        J[:, self.grid.frame_rows] = np.eye(6)
+        T_map_frame = lie.interpolate(a.T_map_frame[0], b.T_map_frame[0], np.array(u))
+        return T_map_frame, self.chain.covariance(k, (1.0 - u) * J, u * J)
 
     def motion_covariance(self, time: float, nodes: np.ndarray) -> np.ndarray:
         """Covariance (m, 12, 12) of [pose, velocity] of `nodes` (m,) at `time` in the window."""

@@ -80,10 +80,11 @@ class ClockScores(NamedTuple):
 
 @dataclass(slots=True)
 class Guess:
-    """Base (4, 4) and strain (N, 6) from which the first solve starts."""
+    """Base (4, 4), strain (N, 6) and frames (F, 4, 4) from which the first solve starts."""
 
     T_map_base: np.ndarray
     strain: np.ndarray
+    T_map_frame: np.ndarray
 
 
 class Factor(ABC):
@@ -95,7 +96,7 @@ class Factor(ABC):
     """
 
     name: ClassVar[str]
-    consumes: ClassVar[type]
+    consumes: type | tuple[type, ...]
     batch: ClassVar[type]  # named tuple of times and of what a row has, with a number in front
     rate: float = 0.0  # [Hz] of its sensors, where these set the pace of the estimates
     tight: bool = True  # whether it matches as narrowly as while tracking
@@ -133,6 +134,14 @@ class Factor(ABC):
     def awaited(self) -> bool:
         """Whether the first guess of the body is a poor one without this kind of sample."""
         return False
+
+    def needed(self) -> type | None:
+        """Say which kind of sample the filter cannot begin without."""
+        return None
+
+    def lateness(self, measurement: Any) -> float:
+        """By how much a measurement's stamp is later than what it tells of [s]."""
+        return 0.0
 
     def guess(self, row: tuple, guess: Guess) -> None:  # noqa: B027
         """Put what a row tells of base and shape into the first guess."""

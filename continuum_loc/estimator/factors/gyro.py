@@ -152,17 +152,17 @@ def _add(normal, a, b, batch, noise, residuals, work):
         robust = 1.0 / (1.0 + spread / c2)
         cost += 0.5 * noise.shares[imu] * 3.0 * samples * c2 * np.log1p(spread / c2)
         squared += misfit * robust
-        _rows_with_bias(a, n, imu, index)
+        _rows_with_bias(a, n, imu, normal.g.shape[0] // 2, index)
         scatter(normal, index, total, noise.shares[imu] * noise.weight * robust)
         misfit, samples = 0.0, 0
     return cost, squared
 
 
 @kernel
-def _rows_with_bias(column, n, imu, index):
-    """Rows (27,) of a node at two knots, with the older knot's bias between them."""
+def _rows_with_bias(column, n, imu, dim, index):
+    """Rows (27,) of a node at two knots of `dim` each, with the older knot's bias between them."""
     biases = NODE_DIM * column.T.shape[0]
-    rows_in_time(n, biases + 3 * column.bias.shape[0], index)
+    rows_in_time(n, dim, index)
     index[15:] = index[12:24].copy()
     for i in range(3):
         index[12 + i] = biases + 3 * imu + i
