@@ -29,6 +29,7 @@ ROS = (
     'std_srvs',
     'diagnostic_msgs',
     'builtin_interfaces',
+    'visualization_msgs',
     'rosgraph_msgs',
     'tf2_msgs',
     'tf2_ros',

@@ -82,6 +82,8 @@ class Doubts:
             return
         if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
+            if isinstance(measurement, StrainSample):
+                self._hear_strain(measurement, time)
             self._base.note(measurement, time)
         self._read_at_once(measurement, time)
 

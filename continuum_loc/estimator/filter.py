@@ -280,6 +280,7 @@ class SlidingWindowFilter:
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
         covariance[:, :6, :6] += self._rattle_covariance(time, self.grid.s[rings])
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
+        T_map_frame, frame_covariance = self.window.frame(time)
         return Estimate(
             stamp=self.epoch + nanoseconds(time),
             T_map_ring=body.T[rings],
@@ -298,4 +299,6 @@ class SlidingWindowFilter:
             converged=outcome[1],
             step_seconds=clock.perf_counter() - started,
             lagged=lagged,
+            T_map_frame=T_map_frame,
+            frame_covariance=frame_covariance,
         )
