@@ -31,6 +31,7 @@ REPORTED = (
     'table4',
     'consistency',
     'faults',
+    'implausible',
     'ablation',
     'anomalies',
     'world',
@@ -49,7 +50,15 @@ the numbers were changed, and it was run again.
 
 def sets() -> dict[str, list[str]]:
     """Each set of trials that is tuned on or reported, as what decides its trials."""
-    from studies import ablation, anomalies_hold_out, consistency, faults, table2, world
+    from studies import (
+        ablation,
+        anomalies_hold_out,
+        consistency,
+        faults,
+        implausible,
+        table2,
+        world,
+    )
     from studies._soft_arm import soft_arm_trials
 
     cases = [case.trial for case in faults.fault_cases(False, 0)]
@@ -61,6 +70,9 @@ def sets() -> dict[str, list[str]]:
         'reported: table3, table4': told(soft_arm_trials(False, 0)),
         'reported: consistency': told(consistency.trials(False, 0)),
         'reported: faults': told(cases),
+        'reported: implausible': told(
+            case.trial for case in implausible.implausible_cases(False, 0)[0]
+        ),
         'reported: ablation': told(case.trial for case in variants),
         'reported: world': told(world.trials(False, 0)),
     }

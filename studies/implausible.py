@@ -25,14 +25,18 @@ from continuum_loc.measurements import (
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot, RobotDescription
-from continuum_loc.simulator.faults import Fault
+from continuum_loc.simulator.departures import sensor_departures
+from continuum_loc.simulator.faults import ClockOffset, Fault
 import numpy as np
 from studies._filter_runs import Case, CaseResult, failures, longest_unannounced, run_cases
 from studies._pages import write_page
 from studies.support.split import require_unseen
 
+FRESH = 4000  # first seed: no limit was chosen on a recording of these
+TRULY_LATE = 0.02  # s: a sensor whose clock is off by this may be named so
 WITHIN = 3.0  # s of data in which the cause has to be named
-CLEAN = 'as described'
+CLEAN, DISTURBED, WORLD = 'as described', 'disturbed', 'world disturbed'
+DISTURBED_RUNS = 5  # of each kind and trajectory
 DEGREES = 180.0 / np.pi
 
 Change = Callable[[Any, RobotDescription], Any]
@@ -185,9 +189,10 @@ TEXT = """
 One thing is not as described, from the first sample on. *Named after* is the time of data until
 the reason that the filter gives for the sensor says the likely cause; *blamed* are other sensors
 that it suspects at any time. *Silent* is the longest time for which a ring was more than 5 cm off
-while the status was `tracking`. Disturbed runs (mounts 2 mm and 1 deg off, gyros biased, ToF
-clocks 10 ms late) with nothing else wrong say how often healthy sensors are blamed in a world that
-departs from its description everywhere.
+while the status was `tracking`. Disturbed runs with nothing else wrong say how often healthy
+sensors are blamed where all departs from the description: mounts 2 mm and 1 deg off, gyros biased
+and ToF clocks 10 ms late; and in the world of `simulate --world disturbed`, where the sensors of a
+board that is truly 20 ms late, or more, are no healthy ones.
 """.strip()
 
 
@@ -212,18 +217,19 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 def implausible_cases(quick: bool, seed: int) -> tuple[list[Case], dict[str, Kind]]:
     """Every kind in every trial, with clean and disturbed runs; kinds by the case's folder."""
-    trials = [Trial(trajectory=name, seed=seed, duration=5.0) for name in ('t2', 't3')]
+    first = FRESH + seed
+    trials = [Trial(trajectory=name, seed=first, duration=5.0) for name in ('t2', 't3')]
     trials = trials[:1] if quick else trials
     kinds = [kind for kind in ENGINE if not quick or kind.name in QUICK]
     cases, by_folder = [], {}
     for number, trial in enumerate(trials):
         cases.append(Case(CLEAN, trial))
         if not quick:
-            cases += [
-                Case('disturbed', replace(trial, disturbed=True, seed=seed + k)) for k in range(5)
-            ]
+            seeds = range(first + 1, first + 1 + DISTURBED_RUNS)
+            cases += [Case(DISTURBED, replace(trial, disturbed=True, seed=one)) for one in seeds]
+            cases += [Case(WORLD, replace(trial, world='disturbed', seed=one)) for one in seeds]
         for kind in kinds:
-            for name, who in chosen(kind, seed + number, quick):
+            for name, who in chosen(kind, first + number, quick):
                 case = Case(f'{kind.name}, {name}', trial, faults=(fault_of(kind, who),))
                 cases.append(case)
                 by_folder[case.folder] = replace(kind, who=who)
@@ -248,7 +254,7 @@ def fault_of(kind: Kind, who: tuple[str, ...]) -> Altered:
 
 def row(result: CaseResult, kind: Kind | None) -> dict[str, Any]:
     """Tell what the filter said of a case."""
-    culprits = struck(kind) if kind else set()
+    culprits = struck(kind) if kind else late(result.case.trial)
     blamed = {name for reasons in result.reasons for name in reasons} - culprits - {'status'}
     after = named_after(result, kind, culprits) if kind else None
     settled = len(result.times) // 4
@@ -271,6 +277,14 @@ def struck(kind: Kind) -> set[str]:
     return {name for name in names if any(pattern.fullmatch(name) for pattern in patterns)}
 
 
+def late(trial: Trial) -> set[str]:
+    """Names of the sensors whose clocks a trial's world has off."""
+    robot, departures = load_robot(trial.robot), trial.departures
+    found = sensor_departures(robot, departures, trial.fidelity, trial.seed)
+    clocks = [one for one in found if isinstance(one, ClockOffset)]
+    return {name for one in clocks if abs(one.offset) >= TRULY_LATE for name in one.sensors}
+
+
 def named_after(result: CaseResult, kind: Kind, culprits: set[str]) -> float:
     """Time [s] of data until a struck sensor is named with the likely cause; inf if never."""
     for time, reasons in zip(result.steps, result.reasons, strict=True):
@@ -291,7 +305,7 @@ def judge(rows: Sequence[dict[str, Any]], failed: int) -> list[Claim]:
     """Causes named in time, nobody else blamed, nothing silent."""
     altered = [one for one in rows if one['named after [s]'] is not None]
     clean = [one for one in rows if one['case'] == CLEAN]
-    disturbed = [one for one in rows if one['case'] == 'disturbed']
+    disturbed = {name: [one for one in rows if one['case'] == name] for name in (DISTURBED, WORLD)}
     claims = [
         at_least(
             'cause named within 3 s',
@@ -313,13 +327,14 @@ def judge(rows: Sequence[dict[str, Any]], failed: int) -> list[Claim]:
         ),
         at_most('cases that failed', failed, '', 0),
     ]
-    if disturbed:
-        claims.append(
-            at_most(
-                'disturbed runs in which a healthy sensor is blamed',
-                np.mean([one['blamed'] != '-' for one in disturbed]),
-                'share',
-                0.02,
-            )
+    claims += [
+        at_most(
+            f'{name}: runs in which a healthy sensor is blamed',
+            np.mean([one['blamed'] != '-' for one in members]),
+            'share',
+            0.02,
         )
+        for name, members in disturbed.items()
+        if members
+    ]
     return claims

@@ -10,11 +10,14 @@ LEAST, SIGMAS = 0.025, 5.0
 def evidence(gradient, own, taken, spread=None) -> ClockEvidence:
     """Gather what sensors a, b, c ... say: slopes, information, and what the body takes of it."""
     count = len(gradient)
+    gradient, own = np.array(gradient, float), np.array(own, float)
+    taken = np.array(taken, float).reshape(count, count)
     return ClockEvidence(
         list('abcdef'[:count]),
-        np.array(gradient, float),
-        np.array(own, float),
-        np.array(taken, float).reshape(count, count),
+        gradient,
+        np.diag(own) - taken,
+        np.column_stack([gradient, own]),
+        taken,
         np.ones(count) if spread is None else np.array(spread, float),
     )
 
@@ -102,10 +105,10 @@ def test_a_sensor_that_counts_little_is_judged_at_full_weight():
     Own 2,000 is 40,000; the body's part, which goes with the weight twice, 150 is 60,000. The
     body does not follow the sensor, so that its uncertainty adds: sqrt(100,000) / 40,000.
     """
-    found = evidence([-100.0], [2000.0], [150.0]).outside(('a',), 0.05)
+    found = evidence([-2000.0], [4e4], [150.0]).outside(('a',), 0.05)
     assert found.offset == pytest.approx(0.05)
     assert found.sigma == pytest.approx(np.sqrt(1e5) / 4e4)
-    two = evidence([-100.0, -60.0], [2000.0, 2000.0], [[150.0, 20.0], [20.0, 150.0]])
+    two = evidence([-2000.0, -1200.0], [4e4, 4e4], [[150.0, 20.0], [20.0, 150.0]])
     both = two.outside(('a', 'b'), 0.05)
     assert both.offset == pytest.approx(160.0 / 4000.0)
     assert both.sigma == pytest.approx(np.sqrt(8e4 + 340.0 * 400.0) / 8e4)

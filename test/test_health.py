@@ -46,8 +46,8 @@ def test_clock_scores_are_derivatives_by_the_stamps(kind, seed):
         ]
         cost = [factor.linearise(one, a, b, Normal.zeros(2 * grid.dim)).squared for one in late]
         slope = (cost[0] - cost[1]) / (4.0 * STEP)
-        assert slope == pytest.approx(scores.gradient[number], rel=2e-3, abs=1e-6)
-        assert scores.information[number] > 0.0
+        assert slope == pytest.approx(scores.gradient[number, 0], rel=2e-3, abs=1e-6)
+        assert scores.information[number, 0, 0] > 0.0
 
 
 def blamed(fault=None, seed=3, duration=5.0):
@@ -166,10 +166,12 @@ def test_a_drawn_base_keeps_the_spread_of_the_description():
 def test_an_offset_beyond_the_first_order_is_no_clock():
     """Half a second is what a hit body's residuals ask for; its neighbour's 50 ms are told."""
     information = np.array([2e4, 3e4])
+    gradient = information * np.array([-0.5, 0.05])
     evidence = ClockEvidence(
         ['struck', 'late'],
-        information * np.array([-0.5, 0.05]),
-        information,
+        gradient,
+        np.diag(information),
+        np.column_stack([gradient, information]),
         np.zeros((2, 2)),
         np.ones(2),
     )

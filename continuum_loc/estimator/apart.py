@@ -21,6 +21,7 @@ from continuum_loc.estimator.state import Column, NODE_DIM
 from continuum_loc.estimator.window import Window
 import numpy as np
 
+FOUND = 0.5  # [s] of data in which the body still finds its place, and seems to move
 ROTATION = np.arange(3, 6)  # of a node's state
 
 
@@ -81,7 +82,8 @@ class Comparison(ABC):
     def look(self, window: Window) -> dict[str, str] | None:
         """Hear the intervals that are due; causes by sensor, None where nothing was due."""
         last = settled(window) - 1
-        due = [k for k in range(1, last) if window.intervals[k].start > self._heard_to]
+        first = max(self._heard_to, FOUND)
+        due = [k for k in range(1, last) if window.intervals[k].start > first]
         body = Apart.of(window, self.factor) if due else None
         if body is None:
             return None

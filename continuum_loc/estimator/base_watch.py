@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from continuum_loc import lie
 from continuum_loc.estimator.factors import Setup
+from continuum_loc.estimator.tolerance import BASE
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import EncoderSample, Measurement
 import numpy as np
@@ -27,7 +28,7 @@ class BaseWatch:
         base = setup.robot.base
         self._base, self._window, self._grid = base, window, setup.grid
         sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
-        self._variance = np.square(sigma)
+        self._variance = np.square(sigma) + np.square(BASE)
         self._stays = base.measurement.frame == 'map' and base.measurement.drift == 0.0
         self._travel: tuple[float, float] | None = None  # [s], [m]
         self._since: dict[str, float] = {}

@@ -10,19 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from continuum_loc.estimator.clocks import ClockEvidence, ClockOffset
+from continuum_loc.estimator.clocks import ClockEvidence, ClockOffset, Learned
 from continuum_loc.estimator.doubts import Doubts
-from continuum_loc.estimator.factors import Factor
+from continuum_loc.estimator.factors import Factor, TofFactor
 from continuum_loc.estimator.fit import fit_of, flicker
 from continuum_loc.estimator.settings import HealthSettings
+from continuum_loc.estimator.sighting import Sight, Sighting
 from continuum_loc.estimator.window import Window
 from continuum_loc.robot import RobotDescription
 import numpy as np
 
 HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt, not a sensor
 RECENT = 2  # intervals that say whether a ToF sensor fits now
-CERTAIN = 2.0  # times the deviations asked for, and one test will do
+VOTES = 2.7  # squared deviations over those asked for, of tests in a row
 MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
+SEEN_FOR = 1.0  # [s] that what a ToF sensor was found to see holds
+MOST_BLIND = 0.5  # of the ToF sensors may be wrong, else the body is
+LEARNED_FOR = 60.0  # [s] in which what is known of mounts, axes and scales counts half
 KNOWN_FOR = 1.0  # [s] that what was found of the clocks holds without another test
 STILL_SIGMAS = 3.0  # for a clock known to be off
 NOISY, MISFIT = 'noisy', 'does not fit'
@@ -51,8 +55,14 @@ class Health:
         self._tof_names = [sensor.name for sensor in robot.tof if sensor.name in used]
         self._kinds = (self._tof_names, [sensor.name for sensor in robot.imu])
         self._clock_groups = self._groups()
-        self._votes: dict[tuple[str, ...], int] = {}
+        tof = next((one for one in factors if isinstance(one, TofFactor)), None)
+        self._sighting = Sighting(robot, window, tof) if tof else None
+        self._sights: dict[str, tuple[float, Sight]] = {}  # when each was judged, and how
+        self._votes: dict[tuple[str, ...], float] = {}
         self._late: dict[tuple[str, ...], ClockOffset] = {}
+        period = settings.clock_period
+        share = min(period / window.settings.window, 1.0)
+        self._learned = Learned(share, 0.5 ** (period / LEARNED_FOR))
         self._next_clocks, self._clocks_known = settings.clock_start, 0.0
 
     @property
@@ -77,13 +87,12 @@ class Health:
         the body off.
         """
         reasons = dict.fromkeys(self._noisy(), NOISY)
-        misfits = self._misfits()
-        # One alone is wrong itself; several may be pulled off by a sensor of another kind.
-        waiting = self.waiting and len(misfits) > 1
-        for name in misfits:
-            known = name in self.disbelieved
-            if known or not waiting and (body_believed or name not in self._tof_names):
-                reasons[name] = MISFIT
+        self._see(time, every=body_believed)
+        for name in self._misfits():
+            cause = self._sights[name][1].cause if name in self._sights else ''
+            known = name in self.disbelieved or bool(cause)
+            if known or not self.waiting and (body_believed or name not in self._tof_names):
+                reasons[name] = cause or MISFIT
         if not (body_doubted or self.waiting or MISFIT in reasons.values()):
             self._look_at_clocks(time)
         elif time - self._clocks_known > KNOWN_FOR:
@@ -97,17 +106,34 @@ class Health:
 
     def _misfits(self) -> list[str]:
         """Sensors that do not fit while others of their kind do: a wrong mount, a broken part."""
-        intervals, misfits = self._window.intervals, []
-        shares = fit_of(intervals).shares
-        recent = fit_of(intervals[-RECENT:]).shares  # a knocked ToF sensor shows at once
-        shares |= {name: recent[name] for name in self._tof_names if name in recent}
-        for kind in self._kinds:
-            names = [name for name in kind if name in shares]
-            healthy = names and np.median([shares[name] for name in names]) > HEALTHY_SHARE
-            misfits += [
-                name for name in names if healthy and shares[name] < self._settings.sensor_share
-            ]
-        return misfits
+        shares = fit_of(self._window.intervals).shares
+        gyros = {name: share for name, share in shares.items() if name not in self._tof_names}
+        healthy = gyros and np.median(list(gyros.values())) > HEALTHY_SHARE
+        least = self._settings.sensor_share
+        misfits = [name for name, share in gyros.items() if healthy and share < least]
+        # A ToF sensor may fit badly because it sits a little off: that is none of its faults.
+        blind = [name for name, (_, sight) in self._sights.items() if sight.wrong]
+        return misfits + (blind if len(blind) <= MOST_BLIND * len(self._tof_names) else [])
+
+    def _see(self, time: float, every: bool) -> None:
+        """Judge the ToF sensor that fits least, or all that fit badly, and forget the others."""
+        if self._sighting is None:
+            return
+        shares = fit_of(self._window.intervals[-RECENT:]).shares  # a knocked one shows at once
+        bad = [
+            name for name in self._tof_names if shares.get(name, 1.0) < self._settings.sensor_share
+        ]
+        self._sights = {
+            name: seen
+            for name, seen in self._sights.items()
+            if name in bad and time - seen[0] < SEEN_FOR
+        }
+        due = [name for name in bad if name not in self._sights]
+        due.sort(key=lambda name: shares[name])
+        for name in due if every else due[:1]:
+            sight = self._sighting.judge(name)
+            if sight is not None:
+                self._sights[name] = time, sight
 
     def _noisy(self) -> list[str]:
         """Name sensors whose zones match the map in one frame and not in the next."""
@@ -137,7 +163,8 @@ class Health:
         if self._settings.clock_period <= 0.0 or time < self._next_clocks:
             return
         self._next_clocks = time + self._settings.clock_period
-        evidence = ClockEvidence.of(self._window, self._factors)
+        weights = dict.fromkeys(self.disbelieved, self._settings.suspect_weight)
+        evidence = ClockEvidence.of(self._window, self._factors, weights, self._learned)
         if np.max(evidence.spread, initial=0.0) <= MOST_SPREAD:
             self._clocks_known = time
             still = self._still_off(evidence)
@@ -158,16 +185,19 @@ class Health:
     def _newly_off(
         self, evidence: ClockEvidence, known: dict[tuple[str, ...], ClockOffset]
     ) -> dict[tuple[str, ...], ClockOffset]:
-        """Find more clocks that are off: very certainly, or twice in a row."""
+        """
+        Find more clocks that are off: very certainly, or in several tests in a row.
+
+        What the knots miss of a motion looks like a clock for as long as that motion is in sight.
+        """
         options, struck = self._settings, {name for group in known for name in group}
         others = [group for group in self._clock_groups if not struck & set(group)]
         found = evidence.offsets(others, options.clock_offset, options.clock_sigmas)
-        votes = {}
-        for one in found:
-            certain = one.sigmas >= CERTAIN * options.clock_sigmas
-            votes[one.sensors] = self._votes.get(one.sensors, 0) + (2 if certain else 1)
-        self._votes = votes
-        return {one.sensors: one for one in found if votes[one.sensors] >= 2}
+        self._votes = {
+            one.group: self._votes.get(one.group, 0.0) + (one.sigmas / options.clock_sigmas) ** 2
+            for one in found
+        }
+        return {one.sensors: one for one in found if self._votes[one.group] >= VOTES}
 
     def _count(self) -> None:
         """Have disbelieved sensors count little, the measurements in the window included."""

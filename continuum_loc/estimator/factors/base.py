@@ -62,10 +62,11 @@ class FactorReport(NamedTuple):
 
 class ClockScores(NamedTuple):
     """
-    How an interval's cost depends on the clocks of a factor's S sensors, to second order.
+    How an interval's cost depends on what a factor's S sensors may be off by, to second order.
 
-    gradient, information: (S,); coupling (2 D, S) with the offsets of the interval's two columns;
-    spread: (S,) variance of the residuals that no offset explains over that of the noise.
+    Of each sensor's n unknowns the clock comes first, then its `Factor.tolerances`. gradient
+    (S, n), information (S, n, n); coupling (2 D, S, n) with the offsets of the interval's two
+    columns; spread: (S,) variance of the residuals that no offset explains over that of the noise.
     """
 
     gradient: np.ndarray
@@ -74,8 +75,13 @@ class ClockScores(NamedTuple):
     spread: np.ndarray
 
     @classmethod
-    def zeros(cls, sensors: int, dim: int) -> ClockScores:
-        return cls(*np.zeros((2, sensors)), np.zeros((2 * dim, sensors)), np.zeros(sensors))
+    def zeros(cls, sensors: int, unknowns: int, dim: int) -> ClockScores:
+        return cls(
+            np.zeros((sensors, unknowns)),
+            np.zeros((sensors, unknowns, unknowns)),
+            np.zeros((2 * dim, sensors, unknowns)),
+            np.zeros(sensors),
+        )
 
 
 @dataclass(slots=True)
@@ -99,6 +105,8 @@ class Factor(ABC):
     consumes: type | tuple[type, ...]
     batch: ClassVar[type]  # named tuple of times and of what a row has, with a number in front
     rate: float = 0.0  # [Hz] of its sensors, where these set the pace of the estimates
+    # What a sensor may be off by besides its clock, 1 sigma each, in the order of `clock_scores`.
+    tolerances: ClassVar[np.ndarray] = np.empty(0)
     tight: bool = True  # whether it matches as narrowly as while tracking
 
     def __init__(self, setup: Setup, sensors: Collection[str] = ()):

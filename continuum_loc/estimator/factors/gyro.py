@@ -17,6 +17,7 @@ from continuum_loc.estimator.factors.base import (
 )
 from continuum_loc.estimator.normal import gather_rows, new_normal, scatter
 from continuum_loc.estimator.state import ends_in_time, NODE_DIM, rows_in_time
+from continuum_loc.estimator.tolerance import GYRO_AXES, GYRO_SCALE
 from continuum_loc.measurements import ImuSample
 import numpy as np
 
@@ -57,6 +58,7 @@ class GyroFactor(Factor):
     name = 'gyro'
     consumes = ImuSample
     batch = Batch
+    tolerances = np.array([GYRO_AXES, GYRO_AXES, GYRO_AXES, GYRO_SCALE])
 
     def __init__(self, setup):
         super().__init__(setup, [imu.name for imu in setup.robot.imu])
@@ -100,7 +102,7 @@ class GyroFactor(Factor):
         return FactorReport(cost, squared, residuals.size, fits, rattle)
 
     def clock_scores(self, batch, a, b):
-        scores = ClockScores.zeros(len(self.sensors), self.grid.dim)
+        scores = ClockScores.zeros(len(self.sensors), 1 + len(self.tolerances), self.grid.dim)
         _add_clocks(scores, a, b, batch, self._work)
         gradient, information, coupling, squared = scores
         samples = 3.0 * np.maximum(np.bincount(batch.imus, minlength=len(self.sensors)), 1)
@@ -108,12 +110,12 @@ class GyroFactor(Factor):
         robust = self.information / (1.0 + spread / self.settings.gyro.cauchy**2)
         weight = robust * self.weights
         # What no offset explains of the rates may be more than noise: a body that rattles.
-        unexplained = squared - gradient**2 / np.maximum(information, 1e-12)
+        explained = gradient[:, 0] ** 2 / np.maximum(information[:, 0, 0], 1e-12)
         return ClockScores(
-            weight * gradient,
-            weight * information,
-            weight * coupling,
-            robust * unexplained / samples,
+            weight[:, None] * gradient,
+            weight[:, None, None] * information,
+            weight[:, None] * coupling,
+            robust * (squared - explained) / samples,
         )
 
 
@@ -170,9 +172,14 @@ def _rows_with_bias(column, n, imu, dim, index):
 
 @kernel
 def _add_clocks(scores, a, b, batch, work):
-    """Add what each sample says by its slope, the acceleration; its squared error as `spread`."""
-    slope, index, related = np.empty(3), np.empty(24, np.int64), -1
+    """
+    Add what each sample says of its gyro's clock, axes and scale; its squared error as `spread`.
+
+    The rate w changes by X = [dw/dt, [w]x, w] with them.
+    """
+    X, JX, index, related = np.zeros((3, 5)), np.empty((24, 5)), np.empty(24, np.int64), -1
     biases, dt = NODE_DIM * a.T.shape[0], b.time - a.time
+    error, slope = np.empty(3), np.empty(3)
     for m in range(batch.times.shape[0]):
         n, imu, time = batch.nodes[m], batch.imus[m], batch.times[m]
         if n != related:  # samples of an IMU come after one another
@@ -182,14 +189,26 @@ def _add_clocks(scores, a, b, batch, work):
         _acceleration(work, time, dt, slope)
         gp.evaluate(work, time, False, 3)
         at = work[0]
+        _rate_changes(slope, at.v, X)
         for i in range(3):
-            error = at.v[3 + i] + a.bias[imu, i] - batch.omega[m, i]
-            scores.spread[imu] += error * error
-            scores.gradient[imu] += slope[i] * error
-            scores.information[imu] += slope[i] * slope[i]
-            scores.coupling[biases + 3 * imu + i, imu] += slope[i]
-            for j in range(24):
-                scores.coupling[index[j], imu] += slope[i] * at.J_rate[3 + i, j]
+            error[i] = at.v[3 + i] + a.bias[imu, i] - batch.omega[m, i]
+            scores.spread[imu] += error[i] * error[i]
+            scores.coupling[biases + 3 * imu + i, imu] += X[i]
+        scores.gradient[imu] += X.T @ error
+        scores.information[imu] += X.T @ X
+        JX[:, :] = at.J_rate[3:].T @ X
+        for j in range(24):
+            scores.coupling[index[j], imu] += JX[j]
+
+
+@kernel
+def _rate_changes(slope, v, X):
+    """Write X (3, 5) of `_add_clocks` at the velocity v (6,)."""
+    X[:, 0] = slope
+    X[:, 4] = v[3:]
+    X[0, 2], X[0, 3] = -v[5], v[4]
+    X[1, 1], X[1, 3] = v[5], -v[3]
+    X[2, 1], X[2, 2] = -v[4], v[3]
 
 
 @kernel

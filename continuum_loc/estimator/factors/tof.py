@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from continuum_loc import lie_kernels
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
@@ -24,6 +23,7 @@ from continuum_loc.estimator.factors.base import (
 from continuum_loc.estimator.matching import Frame, frame_of, match, Rules, unmatched, weigh
 from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
+from continuum_loc.estimator.tolerance import MOUNT
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 import numpy as np
 
@@ -76,6 +76,7 @@ class TofFactor(Factor):
     name = 'tof'
     consumes = TofFrame
     batch = Batch
+    tolerances = MOUNT
 
     def __init__(self, setup):
         super().__init__(setup, [sensor.name for sensor in setup.robot.tof])
@@ -167,7 +168,7 @@ class TofFactor(Factor):
         return FactorReport(*sums, fits=sensors.tally[:, :2], flicker=sensors.tally[:, 2:])
 
     def clock_scores(self, batch, a, b):
-        scores = ClockScores.zeros(len(self.sensors), self.grid.dim)
+        scores = ClockScores.zeros(len(self.sensors), 1 + len(MOUNT), self.grid.dim)
         planes = self.surface.planes
         _add_clocks(scores, a, b, batch, self.weights, planes, self.rules, self._work)
         return scores._replace(spread=np.ones(len(self.sensors)))  # the loss took care of outliers
@@ -235,9 +236,16 @@ def _count_flicker(before, frame, tally):
 
 @kernel
 def _add_clocks(scores, a, b, batch, weights, planes, rules, work):
-    """Add each frame's v^T g, v^T H v and J^T H v to its sensor's, v the body's velocity then."""
-    local, Hv, tally = new_normal(6), np.empty(6), np.empty(4)
+    """
+    Add what each frame says of its sensor's clock and mount.
+
+    The frame moves by X = [v, 1]: the body's velocity then, or any twist of the mount; what its
+    local equations (H, g) say of these is X^T g, X^T H X and J^T H X.
+    """
+    local, X, HX, tally = new_normal(6), np.zeros((6, 7)), np.empty((6, 7)), np.empty(4)
     index, related = np.empty(24, np.int64), -1
+    for i in range(6):
+        X[i, 1 + i] = 1.0
     for f in range(batch.times.shape[0]):
         n, s, frame = batch.nodes[f], batch.sensors[f], frame_of(batch.frames, f)
         if n != related:  # frames of a node come after one another
@@ -247,9 +255,10 @@ def _add_clocks(scores, a, b, batch, weights, planes, rules, work):
         gp.evaluate(work, batch.times[f], True, 6)
         at = work[0]
         weigh(at.T, frame, weights[s], planes, rules, local, tally)
-        lie_kernels.apply(local.H, at.v, Hv)
-        for i in range(6):
-            scores.gradient[s] += local.g[i] * at.v[i]
-            scores.information[s] += Hv[i] * at.v[i]
-            for j in range(24):
-                scores.coupling[index[j], s] += at.J_pose[i, j] * Hv[i]
+        X[:, 0] = at.v
+        HX[:, :] = local.H @ X
+        scores.gradient[s] += X.T @ local.g
+        scores.information[s] += X.T @ HX
+        J = at.J_pose.T @ HX
+        for j in range(24):
+            scores.coupling[index[j], s] += J[j]
