@@ -43,6 +43,7 @@ BADLY = 1.5  # times what makes all doubtful: one factor alone may be off by mor
 CURVATURES = 8  # newest samples of the strain, whose noise tells its unit
 MOST = 0.7  # of a kind's samples have to fit, whatever else does
 LOW_SHARE = 0.6  # of a sensor's fitting samples: somebody is wrong
+BASES = ('base', 'insertion')  # which let go where all else has the base elsewhere
 BLIND = 'no usable zone'
 
 
@@ -125,8 +126,10 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
+        # Where the rest does not fit either, base and encoder are no better witnesses.
+        off = self._does_not_fit()
         for name, cause in self._base.causes(time).items():
-            self._tell((name,), cause, time)
+            self._tell((name,), '' if off else cause, time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time)
@@ -177,21 +180,23 @@ class Doubts:
 
     def _uneasy(self, time: float) -> bool:
         """Whether the window has not fitted for some time, whoever is to blame."""
+        self._off = self._does_not_fit()
+        return self._lasts('uneasy', self._off, time, self._settings.patience)
+
+    def _does_not_fit(self) -> bool:
         newest = self._window.intervals[-NEWEST:]
         shares = fit_of(newest).shares
-        known = [shares[name] for name in shares if name not in self.causes]
+        known = [share for name, share in shares.items() if name not in (*self.causes, *BASES)]
         misfits = [
             misfit
             for name, misfit in misfit_by_factor(newest).items()
-            if name != 'gyro' and name not in self.causes
+            if name != 'gyro' and name not in (*self.causes, *BASES)
         ]
-        off = (
+        return (
             self._misfit(newest) > self._settings.uneasy
             or max(misfits, default=0.0) > BADLY * self._settings.consistency
             or min(known, default=1.0) < LOW_SHARE
         )
-        self._off = off
-        return self._lasts('uneasy', off, time, self._settings.patience)
 
     @staticmethod
     def _misfit(intervals: Sequence[Interval]) -> float:

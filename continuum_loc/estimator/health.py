@@ -86,14 +86,17 @@ class Health:
         where clocks that are right do not fit either; so do they not beside a sensor that pulls
         the body off.
         """
-        reasons = dict.fromkeys(self._noisy(), NOISY)
+        # Beside one that contradicts the description nobody else is judged by how it fits.
+        alone = not self.told
+        reasons = dict.fromkeys(self._noisy() if alone else (), NOISY)
         self._see(time, every=body_believed)
-        for name in self._misfits():
+        for name in self._misfits() if alone else ():
             cause = self._sights[name][1].cause if name in self._sights else ''
             known = name in self.disbelieved or bool(cause)
             if known or not self.waiting and (body_believed or name not in self._tof_names):
                 reasons[name] = cause or MISFIT
-        if not (body_doubted or self.waiting or MISFIT in reasons.values()):
+        fits = alone and MISFIT not in reasons.values() and self._most_fit()
+        if fits and not (body_doubted or self.waiting):
             self._look_at_clocks(time)
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}
@@ -107,13 +110,19 @@ class Health:
     def _misfits(self) -> list[str]:
         """Sensors that do not fit while others of their kind do: a wrong mount, a broken part."""
         shares = fit_of(self._window.intervals).shares
-        gyros = {name: share for name, share in shares.items() if name not in self._tof_names}
+        gyros = {name: shares[name] for name in self._kinds[1] if name in shares}
         healthy = gyros and np.median(list(gyros.values())) > HEALTHY_SHARE
         least = self._settings.sensor_share
         misfits = [name for name, share in gyros.items() if healthy and share < least]
         # A ToF sensor may fit badly because it sits a little off: that is none of its faults.
         blind = [name for name, (_, sight) in self._sights.items() if sight.wrong]
         return misfits + (blind if len(blind) <= MOST_BLIND * len(self._tof_names) else [])
+
+    def _most_fit(self) -> bool:
+        """Whether most ToF sensors fit as described, without which nothing is said of clocks."""
+        shares = fit_of(self._window.intervals).shares
+        tof = [shares[name] for name in self._tof_names if name in shares]
+        return not tof or np.median(tof) > HEALTHY_SHARE
 
     def _see(self, time: float, every: bool) -> None:
         """Judge the ToF sensor that fits least, or all that fit badly, and forget the others."""
