@@ -90,10 +90,13 @@ class Health:
         alone = not self.told
         reasons = dict.fromkeys(self._noisy() if alone else (), NOISY)
         self._see(time, every=body_believed)
-        for name in self._misfits() if alone else ():
+        misfits = self._misfits() if alone else []
+        # One alone is wrong itself; several may be pulled off by a sensor of another kind.
+        waiting = self.waiting and len(misfits) > 1
+        for name in misfits:
             cause = self._sights[name][1].cause if name in self._sights else ''
             known = name in self.disbelieved or bool(cause)
-            if known or not self.waiting and (body_believed or name not in self._tof_names):
+            if known or not waiting and (body_believed or name not in self._tof_names):
                 reasons[name] = cause or MISFIT
         fits = alone and MISFIT not in reasons.values() and self._most_fit()
         if fits and not (body_doubted or self.waiting):
