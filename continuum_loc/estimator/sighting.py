@@ -26,6 +26,7 @@ from continuum_loc.estimator.window import Window
 from continuum_loc.robot import RobotDescription, TofModel
 import numpy as np
 
+TOO_FAR = 33.1  # chi-squared of six degrees of freedom at 1e-5: no mount is that far off
 FRAMES = 4  # newest of a sensor
 ITERATIONS = 5
 FITS = 0.7  # share of zones that fit where all is as described
@@ -117,15 +118,16 @@ class Sighting:
         return list(zip(poses, frames, batch.nodes[mine], strict=True))
 
     def _laid(self, sensor, poses, frames, reading, spread) -> tuple[float, float]:
-        """Cost of frames that are read in one way, and the share of zones that fit."""
+        """Cost of frames that are read in one way, and the share of zones that fit near by."""
         origin, rays = self._origins[sensor], self._rays[sensor]
         read = [_read_as(frame, reading, origin, rays) for frame in frames]
         stacked = Frame(*(np.array(part) for part in zip(*read, strict=True)))
         tally = np.zeros(4)
         rules = self._tof.rules._replace(reassociate=0.0)
         surface, information = self._tof.surface, np.linalg.inv(spread)
-        cost = _lay(poses, stacked, information, surface, rules, ITERATIONS, tally)
-        return cost, float(tally[1] / max(tally[0], 1.0))
+        cost, moved = _lay(poses, stacked, information, surface, rules, ITERATIONS, tally)
+        share = float(tally[1] / max(tally[0], 1.0))
+        return cost, share if moved < TOO_FAR else 0.0
 
     def _verdict(self, outcomes: list[tuple[float, float]]) -> Sight:
         cost, share = outcomes[0]
@@ -136,6 +138,8 @@ class Sighting:
 
 def _read_as(frame: Frame, reading: Reading, origin: np.ndarray, rays: np.ndarray) -> Frame:
     """Read a frame in another way: its zones' ranges along other beams."""
+    if not reading.cause:
+        return Frame(*frame[:3], *unmatched(len(frame.q)))  # where its points truly are
     variance = frame.variance[reading.zone]
     ranges = np.linalg.norm(frame.q - origin, axis=1)[reading.zone] * reading.scale
     q = origin + np.where(np.isfinite(variance), ranges, 0.0)[:, None] * rays
@@ -147,12 +151,12 @@ def _lay(poses, frames, information, surface, rules, iterations, tally):
     """
     Move all frames by one twist to the least cost, under its prior's information (6, 6).
 
-    poses: (F, 4, 4) of the node at each frame. Returns the cost; `tally` gets usable and fitting
-    zones.
+    poses: (F, 4, 4) of the node at each frame. Returns the cost and the squared twist over its
+    prior's variance; `tally` gets usable and fitting zones.
     """
     total, local = new_normal(6), new_normal(6)
     xi, step, T = np.zeros(6), np.empty((4, 4)), np.empty((4, 4))
-    cost = 0.0
+    cost, prior = 0.0, np.zeros(6)
     for iteration in range(iterations + 1):
         lie_kernels.exp(xi, step)
         prior = information @ xi
@@ -169,4 +173,4 @@ def _lay(poses, frames, information, surface, rules, iterations, tally):
             total.g[:] += local.g
         if iteration < iterations:
             xi -= np.linalg.solve(total.H, total.g)
-    return cost
+    return cost, xi @ prior
