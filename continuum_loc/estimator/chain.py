@@ -15,6 +15,7 @@ solve, and covariances come from the same triangular factors (`Cholesky`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from continuum_loc.compiling import kernel
@@ -60,6 +61,10 @@ class Cholesky:
                     rest = rest - self.L[rows[k], above] @ X[above, columns]
                 np.matmul(self._inverses[k], rest, out=X[rows[k], columns])
         return X
+
+    def unwhiten(self, B: np.ndarray) -> np.ndarray:
+        """L^-T B (D, m)."""
+        return blas.dtrsm(1.0, self.L, B, lower=1, trans_a=1)
 
     def lower(self, b: np.ndarray) -> np.ndarray:
         """L^-1 b (D,)."""
@@ -137,15 +142,25 @@ class Chain:
         """
         C^T H^-1 C (S, S) for C (K, D, S) over all columns, with H the chain's information.
 
-        It takes one forward substitution: sum y_k^T y_k with y_k = L_k^-1 (C_k - Y_k-1^T y_k-1).
+        It takes one forward substitution.
         """
-        total, right = np.zeros((C.shape[2], C.shape[2])), C[0]
+        return sum(y.T @ y for y in self.whiten(C))
+
+    def whiten(self, C: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """L^-1 C (K of (D, S)) for C (K, D, S) over all columns: L L^T = H."""
+        out, right = [], C[0]
         for k in range(len(C)):
-            y = self._factor(k).whiten(right)
-            total += y.T @ y
+            out.append(self._factor(k).whiten(right))
             if k + 1 < len(C):
-                right = C[k + 1] - self._eliminated[k].passed_on(y)
-        return total
+                right = C[k + 1] - self._eliminated[k].passed_on(out[-1])
+        return out
+
+    def unwhiten(self, Z: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """L^-T Z (K of (D, S)): with `whiten` before it, H^-1 C."""
+        out = [self._factor(len(Z) - 1).unwhiten(Z[-1])]
+        for k in range(len(Z) - 2, -1, -1):
+            out.append(self._factor(k).unwhiten(Z[k] - self._eliminated[k].Y @ out[-1]))
+        return out[::-1]
 
     def _factor(self, column: int) -> Cholesky:
         if column < len(self._eliminated):

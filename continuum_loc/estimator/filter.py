@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from operator import itemgetter
 import time as clock
 
+from continuum_loc.corrections import Corrections
 from continuum_loc.errors import MeasurementError, QueryError, SingularError
 from continuum_loc.estimate import Estimate, Status
 from continuum_loc.estimator.cycle import Cycle
@@ -52,6 +53,7 @@ class SlidingWindowFilter:
         self.settings = settings or EstimatorSettings()
         self.grid = Grid(robot, self.settings.node_spacing)
         self.priors = Priors(robot, self.grid, self.settings)
+        self.corrections = Corrections(robot)
         self.setup = Setup(robot, self.grid, self.settings, prior_map)
         self.counts = {kind: Counter() for kind in ('received', 'used', 'dropped', 'restarts')}
         s_imu = {imu.name: robot.sensor_arclength(imu.name) for imu in robot.imu}
@@ -86,6 +88,7 @@ class SlidingWindowFilter:
         Measurements that cannot be used are counted.
         """
         self.counts['received'][type(measurement).__name__] += 1
+        measurement = self.corrections.applied(measurement)
         estimate = self._step() if self._cycle.over(measurement) else None
         if self._admit(measurement) and self._cycle.complete(measurement):
             estimate = self._step()

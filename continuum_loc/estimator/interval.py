@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.factors import ClockScores, Factor, FactorReport
 from continuum_loc.estimator.normal import Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Column
 import numpy as np
@@ -57,6 +59,16 @@ class Interval:
         if factor in self._batches and factor not in self._scores:
             self._scores[factor] = factor.clock_scores(self._batches[factor], a, b)
         return self._scores.get(factor)
+
+    def bordered(self, priors: Priors, a: Column, b: Column, of: Parameters) -> Border:
+        """What priors and measurements say of the constants `of` the robot, as linearised."""
+        dim = len(self.normal.g) // 2
+        border = Border.zeros(2 * dim, of.size)
+        newer = Border(border.C[dim:], border.H, border.g)
+        priors.bordered(newer, b, priors.share(b.time - a.time), of)
+        for factor, batch in self._batches.items():
+            factor.bordered(batch, a, b, border, of)
+        return border
 
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
         """Cost that the quadratic model gives at offsets from the linearisation point."""

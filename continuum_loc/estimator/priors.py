@@ -13,7 +13,9 @@ from typing import NamedTuple
 from continuum_loc import lie, lie_kernels
 from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.normal import add_rows, Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import (
     Column,
@@ -75,6 +77,7 @@ class Priors:
         step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
         self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
         self.T_map_base, base_information = _base_of(robot)
+        self._T_map_start = robot.base.T_map_base
         self._work = gp.new_workspace()
         self._bias_information = 1.0 / gyro.bias_sigma**2
         self._initial_velocity = np.repeat(1.0 / np.square(prior.initial_velocity_sigma), 3)
@@ -120,9 +123,29 @@ class Priors:
         strain and base pose are one observation per `memory`, not one per knot: a knot counts
         them by its share of that time.
         """
-        share, jerked = min((b.time - a.time) / self.memory, 1.0), np.empty(self.grid.nodes)
+        share, jerked = self.share(b.time - a.time), np.empty(self.grid.nodes)
         priors = self._in_time, self._of_column
         return _add(normal, a, b, *priors, share, jerked, self._work), jerked
+
+
+    def share(self, duration: float) -> float:
+        """What rest strain and base pose count by at a knot so long after another [s]."""
+        return min(duration / self.memory, 1.0)
+
+    def bordered(self, border: Border, column: Column, share: float, of: Parameters) -> None:
+        """Add what one column's own factors say of base and length; `border` is that column's."""
+        prior, nodes = self._of_column, self.grid.nodes
+        error = lie.log(lie.inverse(prior.T_map_base) @ column.T[0])
+        right, left = lie.right_jacobian_inverse(error), lie.left_jacobian_inverse(error)
+        back = lie.adjoint(lie.inverse(prior.T_map_base) @ self._T_map_start)
+        columns = of.columns('base', [''])[0]
+        W = np.diag(share * prior.base_information[0])
+        border.add(np.arange(6), right, columns, -left @ back, W, error)
+        rows = NODE_DIM * np.arange(nodes) + STRAIN
+        off = column.strain[:, 0] - prior.rest[0]
+        W = share * prior.rest_information[0] * np.eye(nodes)
+        by_length = np.full((nodes, 1), -prior.rest[0])
+        border.add(rows, np.eye(nodes), of.columns('length', [''])[0], by_length, W, off)
 
 
 def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from continuum_loc import lie
 from continuum_loc.mapping.build import local_shape
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.mapping.prior_map import PriorMap
@@ -124,14 +125,6 @@ def _scan(prior: PriorMap, scan: Scan, rng: np.random.Generator) -> PriorMap:
 
 def _moved(prior: PriorMap, T: np.ndarray) -> PriorMap:
     """Turn the map about its middle, and shift it."""
-    middle = prior.points.mean(axis=0)
-    return PriorMap(
-        (prior.points - middle) @ T[:3, :3].T + middle + T[:3, 3],
-        prior.normals @ T[:3, :3].T,
-        prior.planarity,
-        sigma=prior.sigma,
-        spacing=prior.spacing,
-        oriented=prior.oriented,
-        source=prior.source,
-        seed=prior.seed,
-    )
+    middle = np.eye(4)
+    middle[:3, 3] = prior.points.mean(axis=0)
+    return prior.moved(middle @ T @ lie.inverse(middle))

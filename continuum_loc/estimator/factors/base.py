@@ -18,8 +18,10 @@ from typing import Any, ClassVar, NamedTuple
 
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.matching import Surface, surface_of
 from continuum_loc.estimator.normal import Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
 from continuum_loc.mapping.prior_map import PriorMap
@@ -129,6 +131,9 @@ class Factor(ABC):
     def clock_scores(self, batch: tuple, a: Column, b: Column) -> ClockScores | None:
         """Say how the cost depends on the sensors' clocks; None where that is not asked for."""
         return None
+
+    def bordered(self, batch: tuple, a: Column, b: Column, border: Border, of: Parameters) -> None:  # noqa: B027
+        """Add what the measurements say of the constants `of` the robot to their border."""
 
     def awaited(self) -> bool:
         """Whether the first guess of the body is a poor one without this kind of sample."""

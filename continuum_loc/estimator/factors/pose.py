@@ -13,6 +13,7 @@ from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
+from continuum_loc.estimator.interpolation import interpolated
 from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.readings import travel_cause
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
@@ -68,6 +69,22 @@ class _PoseFactor(Factor):
     def robust(self) -> bool:
         return bool(np.isfinite(self.cauchy))
 
+    def bordered(self, batch, a, b, border, of):
+        found = interpolated(a, b, batch.times, batch.nodes, pose=True, rate=True)
+        error = lie.log(lie.inverse(batch.T_map_node) @ found.T)
+        right = lie.right_jacobian_inverse(error)
+        squared = np.einsum('mi,mij,mj->m', error, batch.information, error)
+        weight = self.weights[batch.sensors] / (1.0 + squared / self.cauchy**2)
+        for m, (columns, by) in enumerate(self._constants(batch, found, error, of)):
+            rows = np.empty(24, np.int64)
+            rows_in_time(batch.nodes[m], self.grid.dim, rows)
+            W = weight[m] * batch.information[m]
+            border.add(rows, right[m] @ found.J_pose[m], columns, by, W, error[m])
+
+    def _constants(self, batch, found, error, of):
+        """Yield columns (p,) in theta of each pose's constants and its error's slope (6, p)."""
+        return iter(())
+
     def weigh(self, doubted, weight):
         # A pose says all of its node at once, and an encoder has no loss: 5 % would be too much.
         return super().weigh(doubted, LEAST_WEIGHT * weight)
@@ -110,6 +127,16 @@ class TrackerFactor(_PoseFactor):
                 ) from None
         return Row(number, node, measurement.T_map_sensor @ T_sensor_ring, information)
 
+    def _constants(self, batch, found, error, of):
+        columns = np.hstack([of.columns(kind, self.sensors) for kind in ('mount', 'clock')])
+        mounts = [lie.adjoint(sensor.mount.T_ring_sensor) for sensor in self.robot.trackers]
+        left, right = lie.left_jacobian_inverse(error), lie.right_jacobian_inverse(error)
+        by_mount = left @ np.array(mounts)[batch.sensors]
+        by_clock = right @ found.v[:, :, None]
+        yield from zip(
+            columns[batch.sensors], np.concatenate([by_mount, by_clock], axis=2), strict=True
+        )
+
 
 class InsertionFactor(_PoseFactor):
     """Base travel along its own x axis, from the joint state `insertion`."""
@@ -139,6 +166,12 @@ class InsertionFactor(_PoseFactor):
         information = np.zeros((6, 6))
         information[0, 0] = insertion.sigma**-2.0
         return Row(0, 0, T_map_base, information)
+
+    def _constants(self, batch, found, error, of):
+        columns = of.columns('base', [''])[0]
+        back = lie.adjoint(lie.inverse(batch.T_map_node) @ self.robot.base.T_map_base)
+        for by in -lie.left_jacobian_inverse(error) @ back:
+            yield columns, by
 
     def awaited(self):
         return self.robot.base.insertion.mode == 'measured'
