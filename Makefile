@@ -1,5 +1,5 @@
-# make demo | test | lint | bench | bench-check | profile | install | clean. Everything runs in .venv, which `install` makes.
-.PHONY: install demo test lint bench bench-check profile clean
+# make demo | test | test-noble | test-noble-quick | lint | bench | bench-check | profile | install | clean. Everything runs in .venv, which `install` makes.
+.PHONY: install demo test test-noble test-noble-quick lint bench bench-check profile clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
@@ -32,6 +32,25 @@ demo: install
 test: install
 	$(RUN)/python -m pytest test
 
+# The oldest versions that are allowed, which are those of Ubuntu 24.04, and its Python where there is one.
+NOBLE := .venv-noble
+NOBLE_PYTHON ?= $(shell for p in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python3.12 $(PYTHON); do \
+	$$p -c '' 2>/dev/null && echo $$p && break; done)
+NOBLE_QUICK := test_lie test_gp test_chain test_factors test_window test_filter_claims test_mechanics \
+	test_bag test_cli test_node_parameters test_node_estimator
+
+test-noble: $(NOBLE)/installed
+	PYTHONPATH=. $(NOBLE)/bin/python -m pytest test
+
+test-noble-quick: $(NOBLE)/installed
+	PYTHONPATH=. $(NOBLE)/bin/python -m pytest $(NOBLE_QUICK:%=test/%.py)
+
+$(NOBLE)/installed: requirements-noble.txt
+	@.ci/system-libraries
+	$(NOBLE_PYTHON) -m venv --clear $(NOBLE)
+	$(NOBLE)/bin/python -m pip install --quiet --no-deps -r requirements-noble.txt
+	@touch $@
+
 lint: install
 	$(RUN)/ruff check .
 	$(RUN)/ruff format --check .
@@ -50,5 +69,5 @@ profile: install
 	$(RUN)/python bench/_step_profile.py
 
 clean:
-	rm -rf $(VENV) build dist install log .pytest_cache .ruff_cache .import_linter_cache .hypothesis .cache *.egg-info
+	rm -rf $(VENV) $(NOBLE) build dist install log .pytest_cache .ruff_cache .import_linter_cache .hypothesis .cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -28,7 +28,7 @@ setup(
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}', ['package.xml', 'requirements-jazzy.txt']),
         (f'share/{NAME}/launch', _files('launch', '*.launch.py')),
         (f'share/{NAME}/config', _files('config', '*.yaml')),
         (f'share/{NAME}/rviz', _files('rviz', '*.rviz')),
@@ -39,37 +39,37 @@ setup(
     ],
     python_requires='>=3.11',
     # What the nodes, `replay` and `shape` need; for everything else there are extras, and
-    # `continuum_loc.extras` says which of them brings what is missing.
+    # `continuum_loc.extras` says what to type where something is missing. The versions are the
+    # oldest that were tried: `make test-noble`.
     install_requires=[
-        'numpy>=1.26',
-        'scipy>=1.11',
-        'numba>=0.58',
+        'numpy>=1.26.4',
+        'scipy>=1.11.4',
+        'numba>=0.58.1',
         'llvmlite',  # which numba brings; its version is part of what a kernel was made of
-        'threadpoolctl',
-        'pydantic>=2.4',
-        'pyyaml',
-        'rosbags>=0.11',
+        'threadpoolctl>=3.1.0',
+        'pydantic>=2.4.2',
+        'pyyaml>=6.0.1',
+        'rosbags>=0.11.7',
         'lz4',  # which rosbags brings, as the next; bags that were cut off are read without it
         "backports.zstd; python_version < '3.14'",
         'typer>=0.12.5',
-        'rich',
+        'rich>=13.7.1',
     ],
     extras_require={
         # To simulate, and to draw scenes.
         'simulate': [
-            'mujoco>=3.3',
-            'manifold3d',
-            'coacd',
-            'open3d',
-            'trimesh',
-            'scipy>=1.14',
+            'mujoco>=3.17',
+            'manifold3d>=3.5',
+            'coacd>=1.0.14',
+            'open3d>=0.20',
+            'trimesh>=5.2',
         ],
         # To write reports and tables.
-        'report': ['plotly', 'jinja2', 'pandas', 'pillow'],
+        'report': ['plotly>=7.1', 'jinja2>=3.1.2', 'pandas>=2.1.4', 'pillow>=10.2'],
         # All that a user of the command line may ask for.
         'all': ['continuum_loc[simulate,report]'],
         # To run the studies of a checkout.
-        'studies': ['continuum_loc[all]', 'matplotlib', 'psutil'],
+        'studies': ['continuum_loc[all]', 'matplotlib>=3.8', 'psutil>=5.9.8'],
         # To run the tests of a checkout.
         'test': [
             'continuum_loc[studies]',
@@ -96,7 +96,7 @@ setup(
     maintainer='continuum_loc maintainers',
     maintainer_email='continuum-loc@users.noreply.github.com',
     entry_points={
-        'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES]
-        + ['continuum-loc = continuum_loc.cli:main'],
+        'console_scripts': [f'{node} = {NAME}.start:{node}' for node in NODES]
+        + [f'continuum-loc = {NAME}.start:command_line'],
     },
 )

@@ -23,15 +23,14 @@ def run(quick: bool = False) -> list[dict]:
     """Rows of name and ours_s; `rate_hz` where a row is about messages."""
     from bench.harness import alone
     from continuum_loc.offline.live import run_live
-    from continuum_loc.offline.scene_maps import scene_map_file
+    from continuum_loc.offline.trials import Trial
     from studies.support.footprint import Footprint
 
     footprint = Footprint(period=0.5)
     with tempfile.TemporaryDirectory() as scratch:
         live = run_live(
             Path(scratch),
-            prior_map=scene_map_file('S0'),
-            duration=QUICK_DURATION if quick else DURATION,
+            Trial(duration=QUICK_DURATION if quick else DURATION),
             record=False,
             watch=footprint,
         )

@@ -183,11 +183,24 @@ def _require_close(theirs: np.ndarray, ours: np.ndarray, what: str) -> None:
 # ------------------------------------------------------------ the temporal chain, not linear
 
 
+class Problem(NamedTuple):
+    """Frames and a poor guess (KNOTS, 4, 4) of the knots, `period` [s] apart; noise of motion."""
+
+    times: np.ndarray  # (F,) [s]
+    measured: np.ndarray  # (F, 4, 4)
+    information: np.ndarray  # (F, 6, 6)
+    guess: np.ndarray
+    period: float
+    psd: np.ndarray  # (6,)
+
+
 def _temporal_row(repeats: int) -> dict:
-    times, measured, information, guess, period = _temporal_problem()
-    psd = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
-    ours = lambda: _gauss_newton(times, measured, information, guess, period, psd)  # noqa: E731
-    theirs = _gtsam_chain(times, measured, information, guess, period, psd)
+    problem = _temporal_problem()
+    theirs = _gtsam_chain(problem)
+
+    def ours() -> np.ndarray:
+        return _gauss_newton(problem)
+
     gap = np.abs(ours() - theirs()).max()
     if not gap < AGREEMENT:
         raise RuntimeError(f'the two chains end {gap:.1e} apart')
@@ -200,8 +213,8 @@ def _temporal_row(repeats: int) -> dict:
     )
 
 
-def _temporal_problem():
-    """Make up times, poses (F, 4, 4) and informations (F, 6, 6) of frames; guess; period [s]."""
+def _temporal_problem() -> Problem:
+    """Make up frames of a body that moves by TWIST."""
     rng = np.random.default_rng(0)
     period = 1.0 / (KNOTS - 1)
     times = np.sort(rng.uniform(0.0, 1.0, FRAMES)).clip(1e-3, 1.0 - 1e-3)
@@ -210,11 +223,13 @@ def _temporal_problem():
     information = 1e3 * np.einsum('fzi,fzj->fij', directions, directions)
     knots = np.arange(KNOTS)[:, None] * period
     guess = lie.exp(knots * TWIST) @ lie.exp(SPREAD * rng.normal(size=(KNOTS, 6)))
-    return times, measured, information, guess, period
+    psd = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    return Problem(times, measured, information, guess, period, psd)
 
 
-def _gauss_newton(times, measured, information, guess, period, psd) -> np.ndarray:
+def _gauss_newton(problem: Problem) -> np.ndarray:
     """Knot poses (K, 4, 4) after ITERATIONS, by the estimator's kernels and its chain."""
+    times, measured, information, guess, period, psd = problem
     T, v = guess.copy(), np.zeros((KNOTS, 6))
     start_T = guess[0].copy()
     knot = np.minimum((times / period).astype(np.int64), KNOTS - 2)
@@ -263,67 +278,86 @@ def _linearise(T, v, period, q_inverse, frames, normal, work):
         gather(Normal(normal.H[k], normal.g[k]), local, at.J_pose, product)
 
 
-def _gtsam_chain(times, measured, information, guess, period, psd) -> Callable[[], np.ndarray]:
-    """Pose the same problem to gtsam, whose Pose3 perturbs [rotation; translation]."""
-    import gtsam
+class _GtsamErrors:
+    """Errors of motion and frames as gtsam calls them; its Pose3 perturbs [rotation; shift]."""
 
-    swap = np.array([3, 4, 5, 0, 1, 2])
-    pose, rate = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V
-    work, e, J = gp.new_workspace(), np.empty(12), np.empty((12, 24))
-    at = work[0]
+    SWAP = np.array([3, 4, 5, 0, 1, 2])
 
-    def ends(values, k: int) -> gp.Ends:
-        T, v = (
-            [one(key(k + i)) for i in range(2)]
-            for one, key in ((values.atPose3, pose), (values.atVector, rate))
-        )
-        return gp.Ends(T[0].matrix(), v[0], T[1].matrix(), v[1], period)
+    def __init__(self, problem: Problem) -> None:
+        from gtsam import symbol_shorthand
 
-    def share(J_all: np.ndarray, jacobians) -> None:
+        self.problem, self.pose, self.rate = problem, symbol_shorthand.X, symbol_shorthand.V
+        self._work, self._e, self._J = gp.new_workspace(), np.empty(12), np.empty((12, 24))
+
+    def keys(self, k: int) -> list[int]:
+        """Variables of knots k and k + 1."""
+        return [self.pose(k), self.rate(k), self.pose(k + 1), self.rate(k + 1)]
+
+    def _ends(self, values, k: int) -> gp.Ends:
+        T = [values.atPose3(self.pose(k + i)).matrix() for i in range(2)]
+        v = [values.atVector(self.rate(k + i)) for i in range(2)]
+        return gp.Ends(T[0], v[0], T[1], v[1], self.problem.period)
+
+    def _share(self, J: np.ndarray, jacobians) -> None:
         """By [pose, rate] of two knots, in gtsam's order of a pose's tangent."""
-        jacobians[0], jacobians[1] = J_all[:, swap], J_all[:, 6:12]
-        jacobians[2], jacobians[3] = J_all[:, 12:18][:, swap], J_all[:, 18:]
+        jacobians[0], jacobians[1] = J[:, self.SWAP], J[:, 6:12]
+        jacobians[2], jacobians[3] = J[:, 12:18][:, self.SWAP], J[:, 18:]
 
-    def motion(k: int):
+    def motion(self, k: int) -> Callable:
+        """Error of the motion from knot k to the next."""
+
         def error(_, values, jacobians):
-            gp.motion_error(ends(values, k), e, J, work)
+            gp.motion_error(self._ends(values, k), self._e, self._J, self._work)
             if jacobians is not None:
-                share(J, jacobians)
-            return e.copy()
+                self._share(self._J, jacobians)
+            return self._e.copy()
 
         return error
 
-    def frame(f: int, k: int, tau: float):
+    def frame(self, f: int, k: int, tau: float) -> Callable:
+        """Error of frame f, tau [s] after knot k."""
+        at = self._work[0]
+
         def error(_, values, jacobians):
-            gp.relate(ends(values, k), work)
-            gp.evaluate(work, tau, True, 0)
+            gp.relate(self._ends(values, k), self._work)
+            gp.evaluate(self._work, tau, True, 0)
             lie_kernels.pose_error(
-                measured[f], at['T'], at['gamma'], at['right_gamma'], at['scratch']
+                self.problem.measured[f], at['T'], at['gamma'], at['right_gamma'], at['scratch']
             )
             if jacobians is not None:
-                share(at['right_gamma'] @ at['J_pose'], jacobians)
+                self._share(at['right_gamma'] @ at['J_pose'], jacobians)
             return at['gamma']['x'].copy()
 
         return error
 
-    def keys(k: int) -> list[int]:
-        return [pose(k), rate(k), pose(k + 1), rate(k + 1)]
 
+def _gtsam_chain(problem: Problem) -> Callable[[], np.ndarray]:
+    """Pose the same problem to gtsam."""
+    import gtsam
+
+    errors, d = _GtsamErrors(problem), problem.period
     graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    per_rate = np.array([[12 / period**3, -6 / period**2], [-6 / period**2, 4 / period]])
-    model = gtsam.noiseModel.Gaussian.Information(np.kron(per_rate, np.diag(1 / psd)))
+    per_rate = np.array([[12 / d**3, -6 / d**2], [-6 / d**2, 4 / d]])
+    motion = gtsam.noiseModel.Gaussian.Information(np.kron(per_rate, np.diag(1 / problem.psd)))
     for k in range(KNOTS):
-        initial.insert(pose(k), gtsam.Pose3(guess[k]))
-        initial.insert(rate(k), np.zeros(6))
+        initial.insert(errors.pose(k), gtsam.Pose3(problem.guess[k]))
+        initial.insert(errors.rate(k), np.zeros(6))
         if k < KNOTS - 1:
-            graph.add(gtsam.CustomFactor(model, keys(k), motion(k)))
+            graph.add(gtsam.CustomFactor(motion, errors.keys(k), errors.motion(k)))
     unit = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)
-    graph.add(gtsam.PriorFactorPose3(pose(0), gtsam.Pose3(guess[0]), unit))
-    graph.add(gtsam.PriorFactorVector(rate(0), np.zeros(6), unit))
-    for f, time in enumerate(times):
-        k = min(int(time / period), KNOTS - 2)
-        model = gtsam.noiseModel.Gaussian.Information(information[f])
-        graph.add(gtsam.CustomFactor(model, keys(k), frame(f, k, time - k * period)))
+    graph.add(gtsam.PriorFactorPose3(errors.pose(0), gtsam.Pose3(problem.guess[0]), unit))
+    graph.add(gtsam.PriorFactorVector(errors.rate(0), np.zeros(6), unit))
+    for f, time in enumerate(problem.times):
+        k = min(int(time / d), KNOTS - 2)
+        frame = gtsam.noiseModel.Gaussian.Information(problem.information[f])
+        graph.add(gtsam.CustomFactor(frame, errors.keys(k), errors.frame(f, k, time - k * d)))
+    return _gtsam_solver(graph, initial, errors.pose)
+
+
+def _gtsam_solver(graph, initial, pose: Callable[[int], int]) -> Callable[[], np.ndarray]:
+    """Make the solve of ITERATIONS that gives the knots' poses (KNOTS, 4, 4)."""
+    import gtsam
+
     parameters = gtsam.GaussNewtonParams()
     parameters.setMaxIterations(ITERATIONS)
     parameters.setRelativeErrorTol(0.0)

@@ -47,8 +47,10 @@ class Corrections:
 
     def applied(self, measurement: Measurement) -> Measurement:
         """Return the measurement as an exact sensor would have given it."""
-        name = 'strain' if isinstance(measurement, StrainSample) else getattr(
-            measurement, 'sensor', ''
+        name = (
+            'strain'
+            if isinstance(measurement, StrainSample)
+            else getattr(measurement, 'sensor', '')
         )
         for correct in self._of.get(name, ()):
             measurement = correct(measurement)

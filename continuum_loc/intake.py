@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from continuum_loc.errors import MeasurementError, MessageError
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -303,6 +304,8 @@ class Intake:
                 raise MessageError(
                     'value', f"{topic}: the position of joint 'insertion' is {travel}"
                 )
+        elif isinstance(sample, BaseSample):
+            self._check_base(topic, sample.frame)
         elif isinstance(sample, TruthSample):
             self._check_truth(topic, len(sample.T_map_ring))
 
@@ -330,6 +333,19 @@ class Intake:
                 'value',
                 f'{topic}: stations s must rise within 0 to {self.robot.length} m, got '
                 f'{s.min():.4g} to {s.max():.4g}',
+            )
+
+    def _check_base(self, topic: str, frame: str) -> None:
+        mode, wanted = self.robot.base.mode, self.robot.base.measurement.frame
+        if mode != 'measured':
+            raise MessageError(
+                'not used', f'{topic}: the robot description says that the base is {mode}'
+            )
+        if frame != wanted:
+            raise MessageError(
+                'unknown frame',
+                f"{topic}: the base is given in '{frame[:80]}'; the robot description says "
+                f"'{wanted}' (base.measurement.frame)",
             )
 
     def _check_truth(self, topic: str, poses: int) -> None:

@@ -105,6 +105,21 @@ class TrackedPose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BaseSample:
+    """
+    Where a carried base is told to be, at zero insertion.
+
+    T_frame_base (4, 4) in `frame`, which may drift in `map`; covariance (6, 6) in [rho; phi]
+    order of a right (base-frame) perturbation, all zero where none is stated.
+    """
+
+    stamp: int
+    frame: str
+    T_frame_base: np.ndarray
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class EncoderSample:
     """
     Joint states by name.
@@ -130,4 +145,6 @@ class TruthSample:
     T_map_ring: np.ndarray
 
 
-Measurement = TofFrame | ImuSample | StrainSample | FieldSample | TrackedPose | EncoderSample
+Measurement = (
+    TofFrame | ImuSample | StrainSample | FieldSample | TrackedPose | EncoderSample | BaseSample
+)

@@ -149,9 +149,52 @@ class Insertion(Settings):
         return self
 
 
-class Base(Settings):
-    """Pose of the base in `map` at zero insertion, and how well it is known."""
+class BaseMeasurement(Settings):
+    """
+    What tells where a carried base is: an arm's kinematics, a vehicle's odometry, a tracker.
 
+    Its samples are poses of the base at zero insertion in `frame`. Their error is white noise of
+    each sample and a part that lasts: that of the arm's kinematics, or the drift of odometry.
+    """
+
+    frame: Name = Field('map', description='frame that the poses are given in')
+    rate: float = Field(100.0, gt=0.0, description='samples per second')
+    sigma_position: float = Field(
+        0.0005, gt=0.0, description='white noise of a sample, where the message states none [m]'
+    )
+    sigma_rotation_deg: float = Field(
+        0.05, gt=0.0, description='white noise of a sample, where the message states none [deg]'
+    )
+    lasting: float = Field(
+        5.0,
+        gt=0.0,
+        description="time over which the lasting part of the error, of the base's sigma_position "
+        'and sigma_rotation_deg, becomes another one [s]',
+    )
+    drift: float = Field(
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description='share of its way by which `frame` drifts in `map`; with any, the lasting '
+        'part grows without bound',
+    )
+    latency: float = Field(
+        0.0, description='by how much a stamp is later than the instant of its pose [s]'
+    )
+
+
+class Base(Settings):
+    """
+    Pose of the base in `map` at zero insertion, and how well it is known.
+
+    A `fixed` base stays there. A `measured` one is carried, and its pose told; one in another
+    frame than `map` begins there. A `free` one is carried or lies anywhere, and nothing but the
+    robot's own sensors tells where: it begins there, within the sigmas.
+    """
+
+    mode: Literal['fixed', 'measured', 'free'] = Field(
+        'fixed', description='whether the base stays, is carried and measured, or is anywhere'
+    )
     xyz: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
     sigma_position: float = Field(
@@ -161,6 +204,21 @@ class Base(Settings):
         0.1, gt=0.0, description='standard deviation of the base rotation [deg]'
     )
     insertion: Insertion = Insertion()
+    measurement: BaseMeasurement = BaseMeasurement()
+    speed: tuple[float, float] = Field(
+        (0.3, 0.5), description='how fast a carried base moves and turns, 1 sigma [m/s, rad/s]'
+    )
+    acceleration: tuple[float, float] = Field(
+        (0.01, 0.03),
+        description='white noise on the acceleration of a carried base [m^2/s^3, rad^2/s^3]',
+    )
+
+    @field_validator('speed', 'acceleration')
+    @classmethod
+    def _above_zero(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if min(value) <= 0.0:
+            raise ValueError('both must be greater than 0')
+        return value
 
     @cached_property
     def T_map_base(self) -> np.ndarray:
@@ -315,6 +373,7 @@ class Tolerances(Settings):
     strain_twist_deg: float = Field(5.0, ge=0.0, description='about the backbone [deg]')
     strain_offset: float = Field(0.05, ge=0.0, description='of either bending [1/m]')
     clock: float = Field(0.015, ge=0.0, description='of each board [s]')
+    delay: float = Field(0.005, ge=0.0, description='of each sensor beside its board [s]')
     base_position: float = Field(0.005, ge=0.0, description='per axis [m]')
     base_rotation_deg: float = Field(0.7, ge=0.0, description='per axis [deg]')
     map_position: float = Field(0.0, ge=0.0, description='of the map, per axis [m]')

@@ -13,6 +13,7 @@ from typing import Any
 
 from continuum_loc.errors import MessageError
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -302,6 +303,49 @@ def tracked_pose(message: Any, sensor: str, where: str = 'tracker') -> TrackedPo
     T = transforms_of([message.pose.pose], where)[0]
     covariance = body_covariance(message.pose.covariance, T[:3, :3], where)
     return TrackedPose(stamp_of(message.header, where), sensor, T, covariance)
+
+
+def base_message(make: Messages, sample: BaseSample) -> Any:
+    """Write a PoseWithCovarianceStamped of the base in the sample's frame."""
+    return make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        header=header_message(make, sample.stamp, sample.frame),
+        pose=_base_pose(make, sample),
+    )
+
+
+def base_odometry(make: Messages, sample: BaseSample) -> Any:
+    """Write an Odometry of the base in the sample's frame; a covariance of -1: no twist."""
+    zero = vector_message(make, np.zeros(3))
+    unknown = np.zeros(36)
+    unknown[0] = -1.0
+    return make(
+        'nav_msgs/msg/Odometry',
+        header=header_message(make, sample.stamp, sample.frame),
+        child_frame_id='base_link',
+        pose=_base_pose(make, sample),
+        twist=make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
+            covariance=unknown,
+        ),
+    )
+
+
+def _base_pose(make: Messages, sample: BaseSample) -> Any:
+    return make(
+        'geometry_msgs/msg/PoseWithCovariance',
+        pose=pose_message(make, sample.T_frame_base),
+        covariance=ros_covariance(sample.covariance, sample.T_frame_base[:3, :3]),
+    )
+
+
+def base_sample(message: Any, where: str = 'base/pose') -> BaseSample:
+    """Read the base's pose of a PoseWithCovarianceStamped or Odometry, in its header's frame."""
+    T = transforms_of([message.pose.pose], where)[0]
+    covariance = body_covariance(message.pose.covariance, T[:3, :3], where)
+    frame = frame_of(message.header, where)
+    return BaseSample(stamp_of(message.header, where), frame, T, covariance)
 
 
 def encoder_message(make: Messages, sample: EncoderSample) -> Any:

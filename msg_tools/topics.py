@@ -8,6 +8,7 @@ from typing import Any
 
 from continuum_loc.errors import MessageError
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -99,6 +100,10 @@ TOPICS: dict[str, Topic] = {
         _read(convert.encoder_sample),
         depth=256,
     ),
+    'base/pose': Topic(_POSE, convert.base_message, _read(convert.base_sample), depth=512),
+    'base/odom': Topic(
+        'nav_msgs/msg/Odometry', convert.base_odometry, _read(convert.base_sample), depth=512
+    ),
     'ground_truth/poses': Topic(
         'geometry_msgs/msg/PoseArray', _poses, _read(results.truth_sample), depth=512
     ),
@@ -128,7 +133,15 @@ TOPICS: dict[str, Topic] = {
     ),
 }
 
-INPUTS = ('tof/points', 'imu/data_raw', 'imu/mag', 'strain', 'joint_states')
+INPUTS = (
+    'tof/points',
+    'imu/data_raw',
+    'imu/mag',
+    'strain',
+    'joint_states',
+    'base/pose',
+    'base/odom',
+)
 OUTPUTS = (
     'poses',
     'backbone',
@@ -147,6 +160,7 @@ _SAMPLE_TOPICS = {
     FieldSample: 'imu/mag',
     StrainSample: 'strain',
     EncoderSample: 'joint_states',
+    BaseSample: 'base/pose',
     TruthSample: 'ground_truth/poses',
 }
 

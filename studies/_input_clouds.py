@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 import struct
 
-from continuum_loc.mapping.formats.shapes import Cloud
+from continuum_loc.formats.shapes import Cloud
 import numpy as np
 from studies._input_case import ANYTHING, Case, EITHER, READ, REFUSED
 from studies._input_files import (

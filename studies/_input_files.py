@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from continuum_loc.mapping.formats.shapes import Cloud
-from continuum_loc.mapping.map_files import read_shape
+from continuum_loc.formats.reading import read_shape
+from continuum_loc.formats.shapes import Cloud
 from continuum_loc.mapping.prior_map import PriorMap
 import numpy as np
 from studies._input_case import Case

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import product
 
-from continuum_loc.mapping.formats.shapes import Mesh
+from continuum_loc.formats.shapes import Mesh
 import numpy as np
 from studies._input_case import ANYTHING, Case, EITHER, READ, REFUSED
 from studies._input_files import DECIMALS, DOUBLES, file_case, flipped, PLY_FORMS

@@ -7,7 +7,7 @@ import gzip
 from itertools import product
 from pathlib import Path
 
-from continuum_loc.mapping.map_files import read_shape
+from continuum_loc.formats.reading import read_shape
 import numpy as np
 from studies._input_case import Case, EITHER, READ, REFUSED
 from studies._input_files import cloud_points, COUNT, CUTS, file_case, LINE_ENDS, same

@@ -6,11 +6,12 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.measurements import NANOSECONDS, TofFrame
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.replay import samples_of
 from continuum_loc.offline.runs import load_run
-from continuum_loc.offline.scene_maps import scene_map
+from continuum_loc.offline.trial_runs import trial_map_file
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot
 from continuum_loc.scene.anomalies import (
@@ -39,6 +40,7 @@ from studies.support.campaign import (
     show_progress,
 )
 from studies.support.split import DETECTOR_HOLD_OUT, require_new_scenes
+from studies.support.worlds import by_world, IDEAL, in_worlds, named, told
 from studies.table2 import trials
 
 THRESHOLDS = np.round(np.arange(0.0, 1.0, 0.05), 2)
@@ -55,17 +57,49 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
     Trials that are in `out` already are not run again.
     """
-    return run_scenes(out, out / 'anomalies', trials(quick, seed), seed, jobs)
+    return run_scenes(out, out / 'anomalies', in_worlds(trials(quick, seed)), seed, jobs)
 
 
 def run_scenes(
     out: Path, folder: Path, members: list[Trial], seed: int, jobs: int, tuning: bool = False
 ) -> list[Claim]:
-    """Run trials in `out`, reconstruct their scenes, and write tables and report to `folder`."""
+    """
+    Run trials in `out`, reconstruct their scenes, and write tables and reports to `folder`.
+
+    What is seen in another world than the ideal one lies in a folder of that world.
+    """
     if not tuning:
         require_new_scenes(trial.scene for trial in members)
-    folder.mkdir(parents=True, exist_ok=True)
     outcomes = run_campaign(members, out, jobs)
+    claims, tables = [], {}
+    for world, ones in by_world(outcomes, lambda one: one.trial).items():
+        place = folder if world == IDEAL else folder / world
+        place.mkdir(parents=True, exist_ok=True)
+        found, made = _judge_world(out, place, ones, jobs)
+        claims += told(found, world)
+        tables |= {named(name, world): table for name, table in made.items()}
+    write_study(
+        folder,
+        claims,
+        seed=seed,
+        settings={
+            'trials': [one.trial for one in outcomes],
+            'detector': AnomalySettings(),
+            'fusion': FusionSettings(),
+        },
+        tables=tables,
+        extra={
+            'detector_hold_out': DETECTOR_HOLD_OUT,
+            'failed': {one.trial.name: one.error for one in outcomes if one.error},
+        },
+    )
+    return claims
+
+
+def _judge_world(
+    out: Path, folder: Path, outcomes: list[Outcome], jobs: int
+) -> tuple[list[Claim], dict[str, list[dict[str, Any]]]]:
+    """Reconstruct the scenes of one world's trials; claims and tables, and a report of both."""
     scenes = list(dict.fromkeys(outcome.trial.scene for outcome in outcomes))
     finished = [one.trial for one in outcomes if one.summary is not None]
     work = [
@@ -84,23 +118,8 @@ def run_scenes(
         'precision_recall': curve,
         'clusters': cluster_rows(results),
     }
-    write_study(
-        folder,
-        claims,
-        seed=seed,
-        settings={
-            'trials': [one.trial for one in outcomes],
-            'detector': AnomalySettings(),
-            'fusion': FusionSettings(),
-        },
-        tables=tables,
-        extra={
-            'detector_hold_out': DETECTOR_HOLD_OUT,
-            'failed': {one.trial.name: one.error for one in outcomes if one.error},
-        },
-    )
     write_anomaly_report(folder / 'report.html', claims, tables, results)
-    return claims
+    return claims, tables
 
 
 def judge_scene(out: Path, folder: Path, scene_name: str, members: list[Trial]) -> SceneResult:
@@ -130,7 +149,7 @@ def judge_scene(out: Path, folder: Path, scene_name: str, members: list[Trial]) 
         surfels=len(surface.points),
         rmse_m={name: root_mean_square(distance) for name, distance in off.items()},
         covered=float(np.mean(off['fused'] <= 3.0 * surface.sigma)),
-        clusters=detect_anomalies(estimated, scene_map(members[0].map_scene or scene_name)),
+        clusters=detect_anomalies(estimated, load_map(trial_map_file(members[0]))),
         truth=seen(wanted, true),
         known=len(wanted),
         fused=surface.points[:: max(1, len(surface.points) // SHOWN_SURFELS)],

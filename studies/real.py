@@ -28,7 +28,7 @@ from continuum_loc import lie
 from continuum_loc.errors import StudyError
 from continuum_loc.estimate import Estimate
 from continuum_loc.estimator import gp, load_estimator_settings, SlidingWindowFilter
-from continuum_loc.measurements import nanoseconds, TrackedPose
+from continuum_loc.measurements import nanoseconds, seconds, TrackedPose
 from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.metrics import COVERAGE_BOUND, DOF, nees
 from continuum_loc.robot import load_robot, RobotDescription
@@ -191,14 +191,14 @@ def _in_window(
 
 
 def _between(a: Estimate, b: Estimate, ring: int, stamp: int) -> np.ndarray:
-    return gp.interpolate(
+    ends = gp.Ends(
         a.T_map_ring[ring],
         a.velocity[ring],
         b.T_map_ring[ring],
         b.velocity[ring],
-        (b.stamp - a.stamp) * 1e-9,
-        (stamp - a.stamp) * 1e-9,
-    )[0]
+        seconds(b.stamp, a.stamp),
+    )
+    return gp.interpolate(ends, seconds(stamp, a.stamp)).T
 
 
 def hermite_errors(

@@ -16,7 +16,7 @@ from typing import Any
 
 from continuum_loc.offline.claims import at_least, at_most, Claim, write_study
 from continuum_loc.offline.live import LiveResult, run_live
-from continuum_loc.offline.scene_maps import scene_map_file
+from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.simulator.plant import load_plant
 from continuum_loc.simulator.trajectories import (
@@ -28,6 +28,7 @@ from continuum_loc.simulator.trajectories import (
 )
 import numpy as np
 from studies.support.footprint import Footprint, MEBIBYTE
+from studies.support.worlds import in_worlds, named, told
 import yaml
 
 ROBOT, SCENE, MOTION = 'engine', 'S0', 't1'
@@ -44,45 +45,49 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
 
 
 def soak(out: Path, duration: float, seed: int) -> list[Claim]:
-    """Run the graph for `duration` [s]; memory and growth are judged where that is long enough."""
+    """
+    Run the graph in every world for `duration` [s] each.
+
+    Memory and growth are judged where that is long enough.
+    """
     robot = load_robot(ROBOT)
     motion = trajectory(MOTION, robot, load_plant(robot.name))
     path = out.absolute() / 'sway.yaml'
     path.write_text(yaml.safe_dump(swaying(motion, duration).model_dump(mode='json')))
-    footprint = Footprint(period=1.0)
-    live = run_live(
-        out / 'graph',
-        robot=ROBOT,
-        scene=SCENE,
-        trajectory=str(path),
-        prior_map=scene_map_file(SCENE),
-        duration=duration,
-        seed=seed,
-        record=False,
-        watch=footprint,
-    )
-    course = _course(live, footprint, duration)
-    claims = _flow_claims(live, robot, duration)
-    claims += _course_claims(course, footprint) if duration >= LONG_ENOUGH else []
+    claims, tables, extra = [], {}, {}
+    for trial in in_worlds([Trial(ROBOT, SCENE, str(path), seed=seed, duration=duration)]):
+        footprint, world = Footprint(period=1.0), trial.world
+        live = run_live(out / named('graph', world), trial, record=False, watch=footprint)
+        course = _course(live, footprint, duration)
+        found = _flow_claims(live, robot, duration)
+        found += _course_claims(course, footprint) if duration >= LONG_ENOUGH else []
+        claims += told(found, world)
+        tables[named('course', world)] = course
+        extra[world] = _figures(live, footprint)
     write_study(
         out,
         claims,
         seed=seed,
         settings={'duration': duration, 'robot': ROBOT, 'scene': SCENE},
-        tables={'course': course},
-        extra={
-            'latency_ms': live.latency_ms,
-            'lag_ms': live.lag_ms,
-            'step_ms': live.step_ms,
-            'counts': live.counts,
-            'lost': live.lost,
-            'load': {node: footprint.mean_load(node) for node in footprint.cpu},
-            'memory_mib_per_minute': {
-                node: _growth_per_minute(footprint, node) for node in footprint.memory
-            },
-        },
+        tables=tables,
+        extra=extra,
     )
     return claims
+
+
+def _figures(live: LiveResult, footprint: Footprint) -> dict[str, Any]:
+    """Delays, counts, load and the slope of memory of one run."""
+    return {
+        'latency_ms': live.latency_ms,
+        'lag_ms': live.lag_ms,
+        'step_ms': live.step_ms,
+        'counts': live.counts,
+        'lost': live.lost,
+        'load': {node: footprint.mean_load(node) for node in footprint.cpu},
+        'memory_mib_per_minute': {
+            node: _growth_per_minute(footprint, node) for node in footprint.memory
+        },
+    }
 
 
 def swaying(motion: Drive, duration: float) -> TrajectoryFile:

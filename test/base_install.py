@@ -1,5 +1,5 @@
 """
-An environment as `pip install continuum_loc[ros]` makes it, of links into the present one.
+An environment as `pip install .[ros]` makes it, of links into the present one.
 
 It holds what the base needs, what that needs, and a copy of the package: no extra, no checkout.
 """

@@ -17,7 +17,7 @@ from continuum_loc.measurements import (
     TofFrame,
     TruthSample,
 )
-from continuum_loc.offline.disturbed import scanned
+from continuum_loc.offline.scanned_maps import scanned
 from continuum_loc.offline.trials import simulate, Trial, world
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.departing_sensors import (

@@ -9,8 +9,9 @@ import gzip
 import struct
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.formats.content import bytes_of, SMALL
-from continuum_loc.mapping.map_files import load_map, read_shape, READERS
+from continuum_loc.formats.content import bytes_of, SMALL
+from continuum_loc.formats.reading import read_shape, READERS
+from continuum_loc.mapping.map_files import load_map
 from continuum_loc.mapping.prior_map import PriorMap
 from hypothesis import given, settings
 from hypothesis import strategies as st

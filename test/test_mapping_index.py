@@ -235,9 +235,9 @@ def test_max_distance_is_a_strict_limit():
 @pytest.mark.parametrize(
     ('points', 'said'),
     [
-        (np.empty((0, 3)), r'\(P, 3\)'),
+        (np.empty((0, 3)), r'\(N, 3\)'),
         (np.zeros((4, 2)), r'\(4, 2\)'),
-        (np.array([[0, 0, 0], [0, np.nan, 0.0]]), 'first is row 1'),
+        (np.array([[0, 0, 0], [0, np.nan, 0.0]]), 'first is number 1'),
     ],
 )
 def test_unusable_points_are_refused_by_name(points, said):

@@ -59,11 +59,6 @@ def test_the_same_seed_gives_the_same_map_and_another_seed_another():
     assert not np.array_equal(a.points[:50], c.points[:50])
 
 
-def test_a_region_confines_the_samples():
-    prior = box_map(region=(np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 0.2])))
-    assert prior.points[:, 2].min() >= 0.0 and prior.points[:, 2].max() <= 0.2
-
-
 def test_planarity_is_one_on_a_round_patch_zero_on_a_line_and_low_at_an_edge():
     ring = np.array(
         [[np.cos(a), np.sin(a), 0.0] for a in np.linspace(0, 2 * np.pi, 12, endpoint=False)]
@@ -214,7 +209,6 @@ def test_a_map_cannot_hold_nonsense(changed, said):
         ({'spacing': 0.1, 'count': 5}, 'either'),
         ({'spacing': -1.0}, '> 0'),
         ({'spacing': None, 'count': 0}, '> 0'),
-        ({'region': (np.full(3, 5.0), np.full(3, 6.0))}, 'region'),
     ],
 )
 def test_sampling_refuses_what_it_cannot_do(options, said):

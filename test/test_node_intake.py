@@ -99,11 +99,12 @@ def test_an_overloaded_queue_gives_up_in_its_defined_order():
     for number in range(100):
         for kind in SACRIFICE:
             inbox.put('tracker/em1' if kind == 'tracker/' else kind, number, 0)
-    for capacity in (550, 450, 350, 250, 150, 100):
+    kinds = 100 * len(SACRIFICE)
+    for capacity in range(kinds - 50, 100, -100):
         inbox.settings = IntakeSettings(queue_capacity=capacity, max_backlog=1e9)
         inbox.put('imu/data_raw', 100, 0)
         for index, kind in enumerate(SACRIFICE[:-1]):
-            given_up = 600 + inbox.received['imu/data_raw'] - 100 - capacity - 100 * index
+            given_up = kinds + inbox.received['imu/data_raw'] - 100 - capacity - 100 * index
             assert inbox.dropped[kind] == np.clip(given_up, 0, 100), (capacity, kind)
     oldest = inbox.take(0.0)
     assert oldest.topic == 'imu/data_raw'

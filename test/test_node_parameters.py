@@ -7,12 +7,12 @@ Files are checked, and the YAML of every node is in step.
 import contextlib
 from pathlib import Path
 
+from config.write import config_text, NODES
 from continuum_loc.errors import SettingsError
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes.support import parameters
 from continuum_loc.nodes.support.runtime import PackageNode
 from continuum_loc.nodes.support.settings import EstimatorNodeSettings
-from continuum_loc.nodes.support.write_config import config_text, NODES
 from continuum_loc.offline.domain import Domain
 import pytest
 from rcl_interfaces.msg import ParameterType

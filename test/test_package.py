@@ -12,8 +12,10 @@ import tokenize
 import tomllib
 import xml.etree.ElementTree as ElementTree
 
+from continuum_loc import start
 from continuum_loc.closure import imports_of
-from continuum_loc.extras import EXTRAS, WHAT
+from continuum_loc.errors import NotInstalled
+from continuum_loc.extras import BASE, EXTRAS, not_installed, require_base, WHAT
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -184,6 +186,20 @@ def test_setup_py_names_all_that_the_package_imports_and_nothing_else():
     assert modules[''] <= imported
 
 
+def _oldest():
+    """Return the oldest version that setup.py allows, by distribution, of those that have one."""
+    call = next(
+        node
+        for node in ast.walk(ast.parse((ROOT / 'setup.py').read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == 'setup'
+    )
+    given = {keyword.arg: keyword.value for keyword in call.keywords}
+    lines = ast.literal_eval(given['install_requires']) + sum(
+        ast.literal_eval(given['extras_require']).values(), []
+    )
+    return dict(re.match(r'([\w.-]+)>=([\d.]+)$', line).groups() for line in lines if '>=' in line)
+
+
 def test_what_is_told_to_be_installed_is_what_setup_py_has():
     setup = _setup()
     assert set(EXTRAS) == set(WHAT) == set(setup) - {'', 'all', 'test', 'bench'}
@@ -191,22 +207,40 @@ def test_what_is_told_to_be_installed_is_what_setup_py_has():
         named = {MODULES.get(one, one) for one in setup[extra] - NO_MODULE - setup['']}
         assert set(modules) == named, extra
         assert not set(modules) & setup['']
+        told = str(not_installed(modules[0], extra)).split('pip install ')[1]
+        for one in setup[extra] - {'dask', 'continuum_loc'}:  # brought by others, and ourselves
+            assert one in told, extra
+    assert set(BASE) == setup[''] - {'llvmlite', 'lz4', 'backports.zstd'}  # which others bring
+    assert {name: _oldest()[name] for name in BASE} == BASE
+
+
+def test_the_oldest_versions_allowed_are_those_that_are_tested():
+    """`make test-noble` runs the suite in the environment of requirements-noble.txt."""
+    tested = {}
+    for line in (ROOT / 'requirements-noble.txt').read_text().splitlines():
+        if line and line[0] != '#':
+            name, version = re.match(r'([\w.-]+)(?:\[\w+\])?==([\w.]+)', line).groups()
+            tested[name.lower()] = min(version, tested.get(name.lower(), version))
+    for name, version in _oldest().items():
+        assert f'{tested[name]}.'.startswith(f'{version}.'), (name, version, tested[name])
 
 
 KEYS = {
     'python3-numba': {'numba', 'llvmlite'},
     'python3-pil': {'PIL'},
-    'python3-rosbags-pip': {'rosbags', 'lz4', 'backports'},
+    'python3-venv': set(),  # for what pip has to bring
     'ros2launch': {'launch', 'launch_ros'},
 }
+BROUGHT = {'rosbags': {'rosbags', 'lz4', 'backports'}}
 
 
 def test_package_xml_names_all_that_the_package_imports():
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
     named = {one.text: one.get('condition') for one in package.findall('exec_depend')}
-    modules = {key: KEYS.get(key, {re.sub('^python3-|-pip$', '', key)}) for key in named}
+    assert not [key for key in named if key.endswith('-pip')]  # Ubuntu 24.04 refuses them
+    modules = {key: KEYS.get(key, {re.sub('^python3-', '', key)}) for key in named}
     by_pip = {one.text: one.get('extra', '') for one in package.findall('export/pip')}
-    everything = set().union(*modules.values(), by_pip)
+    everything = set().union(*modules.values(), *(BROUGHT.get(one, {one}) for one in by_pip))
     messages = {
         match
         for folder in ('continuum_loc', 'msg_tools')
@@ -221,6 +255,25 @@ def test_package_xml_names_all_that_the_package_imports():
         assert (condition is None) == (modules[key] <= base), key
     for module, extra in by_pip.items():
         assert module in _setup()[extra]
+
+
+def test_package_xml_asks_for_the_versions_of_setup_py():
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    asked = {
+        re.sub('^python3-', '', one.text).replace('yaml', 'pyyaml'): one.get('version_gte')
+        for one in package.findall('exec_depend') + package.findall('export/pip')
+        if one.get('version_gte')
+    }
+    assert asked == BASE
+    for_pip = {
+        one.text: one.get('version_gte')
+        for one in package.findall('export/pip')
+        if not one.get('extra')
+    }
+    lines = (ROOT / 'requirements-jazzy.txt').read_text().splitlines()
+    assert {f'{name}>={version}' for name, version in for_pip.items()} == {
+        line for line in lines if line[0] != '#'
+    }
 
 
 def test_pyproject_leaves_the_metadata_to_setup_py():
@@ -327,3 +380,49 @@ def test_a_wheel_holds_everything_that_runs(tmp_path):
     } <= set(data)
     packaged = {str(path.relative_to(ROOT)) for path in (ROOT / 'continuum_loc').rglob('*.yaml')}
     assert packaged & set(files) <= set(inside)
+
+
+def test_what_is_missing_or_too_old_is_told_in_one_line(tmp_path):
+    """Pydantic 1 as Ubuntu 24.04 has it, and a library that is not there at all."""
+    old = tmp_path / 'pydantic-1.10.14.dist-info'
+    old.mkdir()
+    (old / 'METADATA').write_text('Metadata-Version: 2.1\nName: pydantic\nVersion: 1.10.14\n')
+    done = subprocess.run(
+        [
+            sys.executable,
+            '-c',
+            'import sys; from continuum_loc import extras, start\n'
+            "extras.BASE['no-such-thing'] = '3.0'; start.estimator()",
+        ],
+        capture_output=True,
+        text=True,
+        env=os.environ | {'PYTHONPATH': f'{tmp_path}:{ROOT}'},
+        timeout=60,
+    )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert 'pydantic 2.4.2 or newer (1.10.14 is installed)' in line
+    assert 'no-such-thing 3.0 or newer (not installed)' in line
+    assert line.endswith("pip install 'pydantic>=2.4.2' 'no-such-thing>=3.0'")
+
+
+def test_where_pip_refuses_the_system_s_python_an_environment_is_made_first(monkeypatch, tmp_path):
+    (tmp_path / 'EXTERNALLY-MANAGED').touch()
+    monkeypatch.setattr('sysconfig.get_path', lambda name: str(tmp_path))
+    monkeypatch.setattr(sys, 'base_prefix', sys.prefix)
+    with pytest.raises(NotInstalled, match='venv --system-site-packages .venv && . .venv/bin/'):
+        require_base({'no-such-thing': '1.0'})
+    monkeypatch.setattr(sys, 'base_prefix', '/usr')  # in an environment
+    with pytest.raises(NotInstalled, match='type: pip install'):
+        require_base({'no-such-thing': '1.0'})
+
+
+def test_versions_are_compared_as_numbers():
+    require_base({'numpy': '1.9.0', 'scipy': '1.9'})  # 1.26 and 1.11 are newer
+
+
+def test_every_command_begins_where_what_it_needs_is_looked_at():
+    text = (ROOT / 'setup.py').read_text()
+    for name in (*NODES, 'command_line'):
+        assert callable(getattr(start, name))
+    assert "f'{node} = {NAME}.start:{node}'" in text and 'start:command_line' in text

@@ -32,7 +32,12 @@ class Border(NamedTuple):
         )
 
     def add(
-        self, rows: np.ndarray, J: np.ndarray, columns: np.ndarray, D: np.ndarray, W: np.ndarray,
+        self,
+        rows: np.ndarray,
+        J: np.ndarray,
+        columns: np.ndarray,
+        D: np.ndarray,
+        W: np.ndarray,
         e: np.ndarray,
     ) -> None:
         """

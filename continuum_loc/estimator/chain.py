@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import SingularError
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.normal import Normal
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -98,6 +99,7 @@ class Chain:
     def __init__(self, dim: int, start: Normal):
         self.dim = dim
         self.marginals = [start]
+        self.border: Border | None = None  # of the oldest column, where constants are estimated
         self._eliminated: list[_Elimination] = []
         self._last: tuple[Cholesky, np.ndarray] | None = None
 
@@ -167,17 +169,34 @@ class Chain:
             return self._eliminated[column].factor
         return self._last[0]
 
-    def forget_oldest(self, oldest: Normal, changed: bool) -> None:
+    def make_oldest_ready(self, oldest: Normal, changed: bool) -> None:
         """
-        Marginalise the oldest column through its interval: the next one's marginal is the start.
+        Eliminate the oldest column through its interval, where that has not been done.
 
-        `changed` says that the interval is not the one of the last solve, so that it has to be
-        eliminated anew.
+        `changed` says that the interval is not the one of the last solve.
         """
         if changed or not self._eliminated:
             self.marginals[1:], self._eliminated[:] = [], []
             self._eliminate(oldest, 0, 0.0)
+
+    def forget_oldest(self) -> None:
+        """Marginalise the oldest column: the next one's marginal becomes the start."""
         del self.marginals[0], self._eliminated[0]
+
+    def pass_on(self, older: np.ndarray, newer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Carry columns C (D, S) of the oldest column on to the next, as its elimination does.
+
+        older, newer: C at either. Returns C at the newer one, and Z = L^-1 C of the older.
+        """
+        step = self._eliminated[0]
+        Z = step.factor.whiten(older)
+        return newer - step.passed_on(Z), Z
+
+    @property
+    def oldest(self) -> np.ndarray:
+        """L^-1 (eta + g_a) (D,) of the oldest column, as its elimination left it."""
+        return self._eliminated[0].y
 
     def _forward(self, intervals: list[Normal], first: int, damping: float) -> None:
         first = min(first, len(self._eliminated))

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
+from continuum_loc.estimator.base_watch import BaseWatch
 from continuum_loc.estimator.explain import Explanation, explanations, Round, Stretch
 from continuum_loc.estimator.factors import Factor, Setup
 from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, share_by_factor
@@ -21,6 +22,7 @@ from continuum_loc.estimator.readings import gyro_cause, range_cause, strain_cau
 from continuum_loc.estimator.settings import DoubtSettings
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     ImuSample,
     Measurement,
@@ -65,6 +67,7 @@ class Doubts:
         named = {factor.name for factor in factors}
         self._gyro_names = [imu.name for imu in setup.robot.imu if 'gyro' in named]
         self._patrolled, self._next_patrol = 0, PATROL
+        self.base = BaseWatch(setup, window)
         self._off = False  # the window does not fit, and no round of explanations has been yet
         self._next_round, self._backoff, self._next_reading = 0.0, 1.0, 0.0
         self._unused = self._is_unused(setup)
@@ -77,6 +80,7 @@ class Doubts:
             return
         if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
+            self.base.note(measurement, time)
         self._read_at_once(measurement, time)
 
     def _read_at_once(self, measurement: Measurement, time: float) -> None:
@@ -103,6 +107,8 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
+        for name, cause in self.base.causes(time).items():
+            self._tell((name,), cause, time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time, epoch)
@@ -218,7 +224,8 @@ class Doubts:
         """Explanations, first those by a gyro that shares its ring with what does not fit."""
         robot = self._setup.robot
         shares = fit_of(self._window.intervals[-NEWEST:]).shares
-        rings = {robot.sensor(name).ring for name, share in shares.items() if share < LOW_SHARE}
+        low = {name for name, share in shares.items() if share < LOW_SHARE}
+        rings = {sensor.ring for sensor in robot.sensors if sensor.name in low}
         if len(rings) > len(robot.rings) / 2:
             return self._candidates
         gyros = {imu.name for imu in robot.imu if imu.ring in rings}
@@ -319,7 +326,7 @@ class Doubts:
 
 def _source(measurement: Measurement) -> str:
     """Name under which a measurement's sensor is accused."""
-    kinds = {StrainSample: 'strain', EncoderSample: 'insertion'}
+    kinds = {StrainSample: 'strain', EncoderSample: 'insertion', BaseSample: 'base'}
     return kinds.get(type(measurement)) or getattr(measurement, 'sensor', '')
 
 

@@ -133,7 +133,9 @@ class Stretch:
                     row = factor.row(measurement)
                 except MeasurementError:
                     continue
-                window.interval_at(time).add(factor, time, row)
+                time -= factor.lateness(measurement)
+                if time > window.columns[0].time:
+                    window.interval_at(time).add(factor, time, row)
 
 
 def base_freed(robot: RobotDescription) -> RobotDescription:

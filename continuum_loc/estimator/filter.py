@@ -8,20 +8,23 @@ and an `Estimate` comes out. `Recovery` notices a body in a wrong minimum and fi
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
+from contextlib import suppress
 from operator import itemgetter
 import time as clock
 
 from continuum_loc.corrections import Corrections
 from continuum_loc.errors import MeasurementError, QueryError, SingularError
 from continuum_loc.estimate import Estimate, Status
+from continuum_loc.estimator.calibrator import Calibrator
 from continuum_loc.estimator.cycle import Cycle
 from continuum_loc.estimator.doubts import Doubts
 from continuum_loc.estimator.factors import Factor, FACTORS, Guess, Setup
 from continuum_loc.estimator.fit import Fit, fit_of, rattle
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.interpolation import backbone, BodyState, rattle_covariance
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
 from continuum_loc.estimator.recovery import Recovery
@@ -35,6 +38,7 @@ from continuum_loc.robot import RobotDescription
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+MOST_CLOCK = 0.3  # [s] by which a clock may be off
 FIRST_PATIENCE = 0.5  # [s] that the first step waits for what tells base and shape
 
 
@@ -53,7 +57,6 @@ class SlidingWindowFilter:
         self.settings = settings or EstimatorSettings()
         self.grid = Grid(robot, self.settings.node_spacing)
         self.priors = Priors(robot, self.grid, self.settings)
-        self.corrections = Corrections(robot)
         self.setup = Setup(robot, self.grid, self.settings, prior_map)
         self.counts = {kind: Counter() for kind in ('received', 'used', 'dropped', 'restarts')}
         s_imu = {imu.name: robot.sensor_arclength(imu.name) for imu in robot.imu}
@@ -65,10 +68,16 @@ class SlidingWindowFilter:
     def reset(self) -> None:
         """Forget everything but the counts; the next measurement starts anew."""
         self.epoch: int | None = None
+        self._describe(self.robot)
         self.newest: int = 0
+        self.priors.let_go(False)
         self.factors = [kind(self.setup) for kind in FACTORS if kind.wanted(self.setup)]
         self._factors_of: dict[type, list[Factor]] = {}
-        self._awaited = {factor.consumes for factor in self.factors if factor.awaited()}
+        awaited = [one.consumes for one in self.factors if one.awaited()]
+        self._awaited = {
+            kind for one in awaited for kind in (one if type(one) is tuple else (one,))
+        }
+        self._needed = {one.needed() for one in self.factors if one.needed()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
         self.health = Health(self.robot, self.window, self.factors, self.settings.health)
@@ -76,6 +85,7 @@ class SlidingWindowFilter:
             self.robot, self.window, self.factors, self.health, self.settings.recovery
         )
         self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
+        self._calibrator = self._new_calibrator()
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle = Cycle(self.factors, self.settings.output_rate)
 
@@ -88,7 +98,9 @@ class SlidingWindowFilter:
         Measurements that cannot be used are counted.
         """
         self.counts['received'][type(measurement).__name__] += 1
-        measurement = self.corrections.applied(measurement)
+        if self._calibrator is not None:
+            self._raw.append(measurement)
+        measurement = self._corrections.applied(measurement)
         estimate = self._step() if self._cycle.over(measurement) else None
         if self._admit(measurement) and self._cycle.complete(measurement):
             estimate = self._step()
@@ -140,6 +152,11 @@ class SlidingWindowFilter:
 
     def _admit(self, measurement: Measurement) -> bool:
         """Put the measurement into its interval; False where it was dropped and counted."""
+        if self._needed:
+            self._needed.discard(type(measurement))
+        if self._needed:
+            self.counts['dropped']['before the base was told'] += 1
+            return False
         if self.epoch is None:
             self._start(measurement.stamp)
         time = seconds(measurement.stamp, self.epoch)
@@ -170,6 +187,10 @@ class SlidingWindowFilter:
         except MeasurementError as error:
             self.counts['dropped'][f'{factor.name}: {error.reason}'] += 1
             return False
+        time -= factor.lateness(measurement)
+        if time < self.window.columns[0].time - TIME_EPSILON:
+            self.counts['dropped']['older than the window'] += 1
+            return False
         self.window.interval_at(time).add(factor, time, row)
         return True
 
@@ -189,7 +210,9 @@ class SlidingWindowFilter:
         with self._threads.limit(limits=1, user_api='blas'):
             # Small matrices: more threads only wait for one another.
             time = seconds(output, self.epoch)
-            return self._estimate(time, self._solve(time), started)
+            estimate = self._estimate(time, self._solve(time), started)
+            self._calibrate(time)
+            return estimate
 
     def _solve(self, time: float) -> tuple[int, bool]:
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
@@ -205,19 +228,78 @@ class SlidingWindowFilter:
         self._rest.finish(self.window, time)
         self.doubts.look(time, self.epoch)
         self.health.hear_of(self.doubts)
+        if self.priors.let_go('base' in self.doubts.causes):
+            self.window.mark_changed()
         self.recovery.look_after(time, outcome[1])
         self.history.note(self.window)
         return outcome
 
+    # ------------------------------------------------------- the robot itself, as it turns out
+
+    def _describe(self, robot: RobotDescription) -> None:
+        """Take what is measured from now on for that of a robot with other constants."""
+        self.setup.robot, self._corrections = robot, Corrections(robot)
+        self.priors.describe(robot)
+
+    def _new_calibrator(self) -> Calibrator | None:
+        self._raw: deque[Measurement] = deque()
+        if not self.settings.calibration.enabled:
+            return None
+        prior_map = self.setup.prior_map
+        middle = None if prior_map is None else prior_map.points.mean(axis=0)
+        parameters = Parameters(self.robot, middle=middle)
+        if parameters.size == 0:
+            return None
+        self.health.corrected = {}
+        calibrator = Calibrator(parameters, self.window, self.settings.calibration)
+        self.doubts.base.spread = calibrator.spread
+        return calibrator
+
+    def _calibrate(self, time: float) -> None:
+        """Read the window anew where the robot turned out to be another than it was taken for."""
+        if self._calibrator is None:
+            return
+        step = self._calibrator.due(time)
+        oldest = self.window.columns[0].time - TIME_EPSILON
+        while self._raw and seconds(self._raw[0].stamp, self.epoch) < oldest - MOST_CLOCK:
+            self._raw.popleft()
+        if step is None:
+            return
+        watch = self.settings.health
+        self._describe(self._calibrator.take(step).robot)
+        self.health.corrected = self._calibrator.late(watch.clock_offset, watch.clock_sigmas)
+        for factor in self.factors:
+            factor.describe(self.setup.robot)
+        for interval in self.window.intervals:
+            interval.clear()
+        for measurement in self._raw:
+            measurement = self._corrections.applied(measurement)
+            at = seconds(measurement.stamp, self.epoch)
+            if oldest <= at <= self.window.columns[-1].time + TIME_EPSILON:
+                self._enter_again(at, measurement)
+
+    def _enter_again(self, time: float, measurement: Measurement) -> None:
+        """Put a measurement that was counted before into its interval."""
+        for factor in self._consumers(type(measurement)):
+            with suppress(MeasurementError):
+                self.window.interval_at(time).add(factor, time, factor.row(measurement))
+
     def _guess(self) -> None:
         """Start from what the first samples tell of base and shape; straight without them."""
         column = self.window.columns[0]
-        guess = Guess(column.T[0], column.strain.copy())
+        guess = Guess(column.T[0], column.strain.copy(), column.T_map_frame)
         for factor in self.factors:
             for row in self.window.intervals[-1].rows(factor)[:1]:
                 factor.guess(row, guess)
         self.window.place(
-            column_at_rest(self.grid, guess.T_map_base, guess.strain, column.time, column.bias)
+            column_at_rest(
+                self.grid,
+                guess.T_map_base,
+                guess.strain,
+                column.time,
+                column.bias,
+                guess.T_map_frame,
+            )
         )
 
     # ------------------------------------------------------------------ the output
@@ -259,6 +341,8 @@ class SlidingWindowFilter:
         covariance = self.window.motion_covariance(time, rings)
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
         covariance[:, :6, :6] += self._rattle_covariance(time, self.grid.s[rings])
+        if self._calibrator is not None:
+            covariance[:, :6, :6] += self._calibrator.spread(rings)
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
         return Estimate(
             stamp=self.epoch + nanoseconds(time),

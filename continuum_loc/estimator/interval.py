@@ -37,6 +37,12 @@ class Interval:
         self._batches.pop(factor, None)
         self.changed = True
 
+    def clear(self) -> None:
+        """Forget all rows, to be read anew; how they fitted is told until then."""
+        for kept in (self._times, self._rows, self._batches, self._scores):
+            kept.clear()
+        self.changed = True
+
     def rows(self, factor: Factor) -> list[tuple]:
         """Rows of one factor, in order of arrival."""
         return self._rows.get(factor, [])

@@ -8,7 +8,8 @@ They come in blocks of one kind and name. Each says how far it may be off by the
     range  a ToF sensor's offset [m] and scale
     gyro   a gyro's axes: the angular velocity is (I + theta) times what is read, rows first
     strain scale, twist [rad] and offsets [1/m] of what the strain sensor reads
-    clock  of a board: true time less stamp [s]. The ToF sensor and the IMU of a ring share one
+    clock  of a board: true time less stamp [s]. ToF sensors and IMU of a ring share one
+    delay  of a sensor beside its board's [s]
     base   T_map_base Exp(theta) at no insertion [m, rad]
     map    of the prior map about its middle [m, rad]
     length of the backbone, relative
@@ -23,13 +24,14 @@ from continuum_loc import lie
 from continuum_loc.robot import based, mounted, RobotDescription
 import numpy as np
 
-KINDS = ('mount', 'range', 'gyro', 'strain', 'clock', 'base', 'map', 'length')
+KINDS = ('mount', 'range', 'gyro', 'strain', 'clock', 'delay', 'base', 'map', 'length')
 PARTS = {
     'mount': ('x', 'y', 'z', 'rx', 'ry', 'rz'),
     'range': ('offset', 'scale'),
     'gyro': tuple(f'{row}{column}' for row in 'xyz' for column in 'xyz'),
     'strain': ('scale', 'twist', 'offset_y', 'offset_z'),
     'clock': ('offset',),
+    'delay': ('offset',),
     'base': ('x', 'y', 'z', 'rx', 'ry', 'rz'),
     'map': ('x', 'y', 'z', 'rx', 'ry', 'rz'),
     'length': ('scale',),
@@ -58,7 +60,7 @@ class Parameters:
         kinds: Sequence[str] = KINDS,
         middle: np.ndarray | None = None,
     ):
-        self.robot = robot
+        self.robot, self._kinds = robot, tuple(kinds)
         self.middle = np.zeros(3) if middle is None else np.asarray(middle, float)
         self.boards = {one.name: f'board {one.ring}' for one in (*robot.tof, *robot.imu)}
         self.boards |= {one.name: one.name for one in robot.trackers}
@@ -103,13 +105,19 @@ class Parameters:
         at = self._places.get((kind, name))
         return None if at is None else theta[at]
 
+    def at(self, theta: np.ndarray) -> Parameters:
+        """Count the same constants from the robot as it is with theta (P,)."""
+        return Parameters(self.applied(theta), self._kinds, self.middle)
+
     def applied(self, theta: np.ndarray) -> RobotDescription:
         """Describe the robot as it is with theta (P,), but for the map."""
         robot = self.robot
         update = {
             'tof': tuple(self._tof(one, theta) for one in robot.tof),
             'imu': tuple(self._imu(one, theta) for one in robot.imu),
-            'trackers': tuple(self._timed(self._mounted(one, theta), theta) for one in robot.trackers),
+            'trackers': tuple(
+                self._timed(self._mounted(one, theta), theta) for one in robot.trackers
+            ),
             'strain': self._strain(theta),
         }
         base = self.of('base', '', theta)
@@ -121,6 +129,14 @@ class Parameters:
             rest += robot.backbone.rest_strain[1:]
             update['backbone'] = robot.backbone.model_copy(update={'rest_strain': rest})
         return robot.model_copy(update=update)
+
+    def lateness(self, name: str) -> np.ndarray:
+        """(P,) by which true time less stamp of a sensor depends on the constants."""
+        out = np.zeros(self.size)
+        for kind in ('clock', 'delay'):
+            columns = self.columns(kind, [name])[0]
+            out[columns[columns >= 0]] = 1.0
+        return out
 
     def T_map_moved(self, theta: np.ndarray) -> np.ndarray:
         """(4, 4) by which the prior map is to be moved."""
@@ -139,10 +155,8 @@ class Parameters:
         return sensor.model_copy(update={'mount': mounted(T_ring_sensor)})
 
     def _timed(self, sensor, theta):
-        clock = self.of('clock', self.boards.get(sensor.name, ''), theta)
-        if clock is None:
-            return sensor
-        return sensor.model_copy(update={'clock': sensor.clock + float(clock[0])})
+        late = self.lateness(sensor.name) @ theta
+        return sensor.model_copy(update={'clock': sensor.clock + float(late)}) if late else sensor
 
     def _tof(self, sensor, theta):
         ranged = self.of('range', sensor.name, theta)
@@ -207,12 +221,13 @@ def _possible(robot: RobotDescription, boards: dict[str, str]):
         yield 'gyro', imu.name, axes.ravel()
     if robot.strain is not None:
         twist = np.radians(told.strain_twist_deg)
-        yield (
-            'strain', 'strain', np.array([told.strain_scale, twist] + 2 * [told.strain_offset])
-        )
-    for board in boards.values():
+        yield ('strain', 'strain', np.array([told.strain_scale, twist] + 2 * [told.strain_offset]))
+    for name, board in boards.items():
         yield 'clock', board, np.array([told.clock])
-    yield 'base', '', np.repeat([told.base_position, np.radians(told.base_rotation_deg)], 3)
+        if board != name:
+            yield 'delay', name, np.array([told.delay])
+    if robot.base.mode == 'fixed':
+        yield 'base', '', np.repeat([told.base_position, np.radians(told.base_rotation_deg)], 3)
     if robot.tof:
         yield 'map', '', np.repeat([told.map_position, np.radians(told.map_rotation_deg)], 3)
     yield 'length', '', np.array([told.length])

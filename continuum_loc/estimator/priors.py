@@ -21,6 +21,7 @@ from continuum_loc.estimator.state import (
     Column,
     ends_along,
     ends_in_time,
+    frame_row,
     Grid,
     NODE_DIM,
     rows_along,
@@ -34,6 +35,11 @@ import numpy as np
 BASE_TRANSVERSE_VELOCITY = 0.02  # [m/s] the base slides along its axis only
 BASE_ANGULAR_VELOCITY = 0.02  # [rad/s]
 MOVING_FACTOR = 10.0  # on the initial velocity's spread, for a body found in motion
+LET_GO = 1e-6  # of the information on a fixed base that is found to be elsewhere
+BASE_PLAIN = 100.0  # ten sigmas: a body that is swung pulls its base by several
+ANYWHERE = (10.0, 3.0)  # [m, rad] spread of a base of which nothing is known but its measurement
+ASTRAY = (0.1, 0.2)  # [m, rad] spread about where a carried base, or its frame, was last
+STEADY = (1e-4, 1e-4)  # [m/sqrt(s), rad/sqrt(s)] drift of odometry at rest
 
 
 class InTime(NamedTuple):
@@ -56,6 +62,27 @@ class OfColumn(NamedTuple):
     rest_information: np.ndarray  # (6,)
     T_map_base: np.ndarray  # (4, 4)
     base_information: np.ndarray  # (2, 6) of the base's pose and of its velocity
+    base_reach: np.ndarray  # (6,) of its pose, with what it may be off by as built
+
+
+class OfFrame(NamedTuple):
+    """
+    How the frame of a measured base may lie in `map`, as poses of the base see it.
+
+    walk (6,): variance per second; drift2 (2,): square of the share of the way and of the turn by
+    which it drifts; pull (6,): information per second that it is `map`.
+    """
+
+    walk: np.ndarray
+    drift2: np.ndarray
+    pull: np.ndarray
+
+
+class OfStart(NamedTuple):
+    """What is known beforehand of a carried base (6,), and of the frame (6,): information."""
+
+    base: np.ndarray
+    frame: np.ndarray
 
 
 class Priors:
@@ -72,11 +99,18 @@ class Priors:
         self.rest = np.array(robot.backbone.rest_strain)
         share = prior.velocity_at_base
         grown = share + (1.0 - share) * (grid.s / grid.s[-1]) ** 2
-        self.velocity_psd = grown[:, None] * np.array(prior.velocity)
+        self._held_psd = grown[:, None] * np.array(prior.velocity)
+        self._carried_psd = self._held_psd + _carried(robot, grid)
+        self._carried = robot.base.mode != 'fixed'
+        self.velocity_psd = self._carried_psd if self._carried else self._held_psd
         self.inverse_strain_rate_psd = 1.0 / np.array(prior.strain_rate)
         step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
         self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
-        self.T_map_base, base_information = _base_of(robot)
+        self.T_map_base, self._base_information = _base_of(robot)
+        self._base_reach = self._reach_of(robot, settings)
+        self._drifts = robot.base.measurement.drift > 0.0
+        self._own_frame = self._drifts or robot.base.measurement.frame != 'map'
+        self._of_frame, self._of_start = _frame_of(robot), _start_of(robot)
         self._T_map_start = robot.base.T_map_base
         self._work = gp.new_workspace()
         self._bias_information = 1.0 / gyro.bias_sigma**2
@@ -95,14 +129,55 @@ class Priors:
             self.rest,
             1.0 / np.square(robot.backbone.rest_strain_sigma),
             self.T_map_base,
-            base_information,
+            self._base_information,
+            self._base_reach,
         )
 
-    def start(self, column: Column, moving: bool = False) -> Normal:
+    def _reach_of(self, robot: RobotDescription, settings: EstimatorSettings) -> np.ndarray:
+        """Make `OfColumn.base_reach`."""
+        information = self._base_information[0]
+        if not settings.calibration.enabled or robot.base.mode != 'fixed':
+            return information
+        told = robot.tolerances
+        built = np.repeat([told.base_position, np.radians(told.base_rotation_deg)], 3)
+        return 1.0 / (1.0 / information + np.square(built))
+
+    def describe(self, robot: RobotDescription) -> None:
+        """Take the base and the rest strain of a robot with other constants (`parameters`)."""
+        self.T_map_base, _ = _base_of(robot)
+        self._T_map_start = robot.base.T_map_base
+        self.rest = np.array(robot.backbone.rest_strain)
+        self._of_column = self._of_column._replace(rest=self.rest, T_map_base=self.T_map_base)
+
+    def let_go(self, loose: bool) -> bool:
+        """
+        Take a fixed base for one that is carried, or believe it again; True if that is new.
+
+        For a base of which it was found that it is not where it is said to be.
+        """
+        if self._carried or loose == (self.velocity_psd is self._carried_psd):
+            return False
+        self.velocity_psd = self._carried_psd if loose else self._held_psd
+        self._in_time = self._in_time._replace(inverse_velocity_psd=1.0 / self.velocity_psd)
+        share = LET_GO if loose else 1.0
+        self._of_column = self._of_column._replace(
+            base_information=share * self._base_information, base_reach=share * self._base_reach
+        )
+        return True
+
+    def start(
+        self,
+        column: Column,
+        first: Column | None = None,
+        moving: bool = False,
+        wandered: bool = False,
+    ) -> Normal:
         """
         Return the first column's own factors, linearised there: what is known beforehand.
 
-        `moving` loosens the velocity, for a body found in the middle of its motion.
+        first: the column about which a carried base and its frame are known, by default itself.
+        `moving` loosens the velocity, for a body found in the middle of its motion; `wandered`
+        what was known of a carried base at the very start.
         """
         velocity = self._initial_velocity * (MOVING_FACTOR**-2 if moving else 1.0)
         start = Normal.zeros(self.grid.dim)
@@ -111,9 +186,25 @@ class Priors:
             at = slice(NODE_DIM * n + VELOCITY, NODE_DIM * n + VELOCITY + 6)
             start.H[at, at] += np.diag(velocity)
             start.g[at] += velocity * column.velocity[n]
-        biases = np.arange(self.grid.bias_offset, self.grid.dim)
+        biases = np.arange(self.grid.bias_offset, self.grid.frame_offset)
         start.H[biases, biases] += self._bias_information
+        if self._carried:
+            self._start_base(start, column, first or column, wandered)
         return start
+
+    def _start_base(self, start: Normal, column: Column, first: Column, wandered: bool) -> None:
+        """Add where a carried base begins, and where the frame of its measurement lies."""
+        base, frame = self._of_start
+        if wandered:
+            base, frame = (np.minimum(one, _loosely(ASTRAY)) for one in (base, frame))
+        _add_known(start, 0, first.T[0], column.T[0], base)
+        for f in range(self.grid.frames):
+            # About `map` itself, unless the frame is another one or drifts.
+            known = first.T_map_frame[f] if self._own_frame else np.eye(4)
+            information = frame if self._own_frame else self._of_start.frame
+            at = self.grid.frame_offset + 6 * f
+            seen = lie.adjoint(lie.inverse(column.T[0]) @ column.T_map_frame[f])
+            _add_known(start, at, known, column.T_map_frame[f], information, seen)
 
     def add(self, normal: Normal, a: Column, b: Column) -> tuple[float, np.ndarray]:
         """
@@ -125,8 +216,10 @@ class Priors:
         """
         share, jerked = self.share(b.time - a.time), np.empty(self.grid.nodes)
         priors = self._in_time, self._of_column
-        return _add(normal, a, b, *priors, share, jerked, self._work), jerked
-
+        cost = _add(normal, a, b, *priors, share, jerked, self._work)
+        if self.grid.frames:
+            cost += _add_frame(normal, a, b, self._of_frame, self._work)
+        return cost, jerked
 
     def share(self, duration: float) -> float:
         """What rest strain and base pose count by at a knot so long after another [s]."""
@@ -140,6 +233,8 @@ class Priors:
         back = lie.adjoint(lie.inverse(prior.T_map_base) @ self._T_map_start)
         columns = of.columns('base', [''])[0]
         W = np.diag(share * prior.base_information[0])
+        far = error @ (prior.base_reach * error)
+        W *= BASE_PLAIN / max(BASE_PLAIN, far)  # as `_add_base` lets it go
         border.add(np.arange(6), right, columns, -left @ back, W, error)
         rows = NODE_DIM * np.arange(nodes) + STRAIN
         off = column.strain[:, 0] - prior.rest[0]
@@ -158,7 +253,64 @@ def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
         sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
         rate[0] = 1.0
     along = lie.exp(np.array([middle, 0, 0, 0, 0, 0]))
+    if base.mode != 'fixed':
+        rate = np.repeat(np.square(base.speed), 3)
+        return base.T_map_base @ along, np.stack([np.zeros(6), 1.0 / rate])
     return base.T_map_base @ along, np.stack([sigma**-2.0, rate**-2.0])
+
+
+def _carried(robot: RobotDescription, grid: Grid) -> np.ndarray:
+    """(N, 6) process noise of nodes that are carried along by their base, as if straight."""
+    shift, turn = robot.base.acceleration
+    psd = np.empty((grid.nodes, 6))
+    psd[:, 0], psd[:, 3:] = shift, turn
+    psd[:, 1:3] = shift + turn * np.square(grid.s)[:, None]
+    return psd
+
+
+def _lasting(robot: RobotDescription) -> np.ndarray:
+    """Variance (6,) of the part of a base's error that lasts."""
+    base = robot.base
+    return np.repeat(np.square([base.sigma_position, np.radians(base.sigma_rotation_deg)]), 3)
+
+
+def _loosely(spread: tuple[float, float]) -> np.ndarray:
+    return np.repeat(1.0 / np.square(spread), 3)
+
+
+def _start_of(robot: RobotDescription) -> OfStart:
+    """Make `OfStart`: a free base is known by its description, a measured one by its frame."""
+    known, insertion = 1.0 / _lasting(robot), robot.base.insertion
+    if insertion.mode == 'unknown' and robot.base.mode == 'free':
+        known[0] = 1.0 / (1.0 / known[0] + np.ptp(insertion.range) ** 2)
+    return OfStart(known if robot.base.mode == 'free' else _loosely(ANYWHERE), known)
+
+
+def _frame_of(robot: RobotDescription) -> OfFrame:
+    told, lasting = robot.base.measurement, _lasting(robot)
+    drift2 = np.full(2, told.drift**2)
+    if told.drift > 0.0:
+        return OfFrame(np.repeat(np.square(STEADY), 3), drift2, np.zeros(6))
+    pull = np.zeros(6) if told.frame != 'map' else 1.0 / (lasting * told.lasting)
+    return OfFrame(2.0 * lasting / told.lasting, drift2, pull)
+
+
+def _add_known(
+    normal: Normal,
+    at: int,
+    T_known: np.ndarray,
+    T: np.ndarray,
+    information: np.ndarray,
+    seen: np.ndarray | None = None,
+) -> None:
+    """Add that T (4, 4), at row `at`, is T_known: information (6,) in T's frame, or as `seen`."""
+    e = lie.log(lie.inverse(T_known) @ T)
+    J = lie.right_jacobian_inverse(e)
+    if seen is not None:
+        e, J = seen @ e, seen @ J
+    rows = slice(at, at + 6)
+    normal.H[rows, rows] += np.triu(J.T @ (information[:, None] * J))
+    normal.g[rows] += J.T @ (information * e)
 
 
 @kernel
@@ -224,6 +376,45 @@ def _add_bias(normal, a, b, weight):
 
 
 @kernel
+def _add_frame(normal, a, b, prior, work):
+    """
+    Add how the frame of a measured base moves in `map`; the cost.
+
+    Its errors are those of the base: a turn of it about the base, not about its own far origin.
+    """
+    at, dim = work[0], normal.g.shape[0] // 2
+    scratch, seen = at.scratch, np.empty((6, 6))
+    e, J, weights = np.empty(6), np.empty((6, 12)), np.empty(6)
+    lie_kernels.pose_error(a.T[0], b.T[0], at.gamma, at.right_gamma, scratch)
+    way, dt = at.gamma.x, b.time - a.time
+    for i in range(6):
+        first = 3 * (i // 3)
+        moved2 = way[first] ** 2 + way[first + 1] ** 2 + way[first + 2] ** 2
+        weights[i] = 1.0 / (prior.walk[i] * dt + prior.drift2[i // 3] * moved2)
+    lie_kernels.relative(b.T[0], b.T_map_frame[0], scratch.pose)
+    lie_kernels.adjoint(scratch.pose, seen)
+    lie_kernels.pose_error(a.T_map_frame[0], b.T_map_frame[0], at.xi, at.right, scratch)
+    lie_kernels.apply(seen, at.xi.x, e)
+    for i in range(6):
+        for j in range(6):
+            J[i, j] = J[i, 6 + j] = 0.0
+            for k in range(6):
+                J[i, j] -= seen[i, k] * (at.right[k, j] - at.xi.ad[k, j])  # J_l^-1
+                J[i, 6 + j] += seen[i, k] * at.right[k, j]
+    index = frame_row(a) + np.arange(12)
+    index[6:] += dim - 6
+    squared = add_rows(normal, index, e, J, weights)
+    lie_kernels.pose_error(np.eye(4), b.T_map_frame[0], at.xi, at.right, scratch)
+    lie_kernels.apply(seen, at.xi.x, e)
+    for i in range(6):
+        for j in range(6):
+            J[i, j] = 0.0
+            for k in range(6):
+                J[i, j] += seen[i, k] * at.right[k, j]
+    return 0.5 * (squared + add_rows(normal, index[6:], e, J[:, :6], prior.pull * dt))
+
+
+@kernel
 def _add_column(normal, column, prior, share, work):
     """Add the factors of one column to its own equations; returns the squared error."""
     squared = _add_space(normal, column, prior, share, work)
@@ -261,14 +452,26 @@ def _add_space(normal, column, prior, share, work):
 
 @kernel
 def _add_base(normal, column, prior, share, work):
-    """Add the base's pose and velocity; the squared error."""
+    """
+    Add the base's pose and velocity; twice their cost.
+
+    A base that all the rest has far from where it should be is let go: a square up to BASE_PLAIN,
+    and its logarithm beyond.
+    """
     at, velocity = work[0], column.velocity[0]
     lie_kernels.pose_error(prior.T_map_base, column.T[0], at.xi, at.right, at.scratch)
-    error, J, squared = at.xi.x, at.right, 0.0
+    error, J, squared, far = at.xi.x, at.right, 0.0, 0.0
+    for i in range(6):
+        rate = prior.base_information[1, i] * velocity[i] * velocity[i]
+        squared += prior.base_information[0, i] * error[i] * error[i] + rate
+        far += prior.base_reach[i] * error[i] * error[i] + rate
+    if far > BASE_PLAIN:
+        share *= BASE_PLAIN / far
+        squared *= 1.0 + np.log(far / BASE_PLAIN)
+    cost = share * squared
     for i in range(6):
         information = prior.base_information[0, i] * share
         rate = prior.base_information[1, i] * share
-        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
         for j in range(6):
             weighted = information * J[i, j]
             normal.g[j] += weighted * error[i]
@@ -276,4 +479,4 @@ def _add_base(normal, column, prior, share, work):
                 normal.H[j, k] += weighted * J[i, k]
         normal.H[VELOCITY + i, VELOCITY + i] += rate
         normal.g[VELOCITY + i] += rate * velocity[i]
-    return squared
+    return cost

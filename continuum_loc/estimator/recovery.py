@@ -168,14 +168,13 @@ class Recovery:
         if not rows:
             return False
         past = window.snapshot() if self.acquired else None
+        window.wandered = self.acquired
         window.keep_newest(SEARCH_INTERVALS)
         present = window.columns[-1]
         mine = self._refine()
         tries = [mine]
         for strain in self._shapes.find(present.T[0], Snapshot.of(rows)):
-            window.place(
-                column_at_rest(window.grid, present.T[0], strain, present.time, present.bias)
-            )
+            window.place(column_at_rest(window.grid, present.T[0], strain, *_known(present)))
             tries.append(self._refine())
         slack = 0.0 if past is None else SHARE_SLACK  # a body that was tracked is not lightly left
         better = [one for one in tries if self._beats(one, mine, slack)]
@@ -224,3 +223,8 @@ class Recovery:
 
 def _cost(one: Try) -> float:
     return one.cost
+
+
+def _known(column: Column) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return what another body would share with a column: time, biases and the base's frame."""
+    return column.time, column.bias, column.T_map_frame

@@ -149,6 +149,13 @@ class TrackerSettings(Settings):
     cauchy: float = Field(4.0, gt=0.0, description='scale of the Cauchy loss in sigmas')
 
 
+class BaseSettings(Settings):
+    """Measured pose of a carried base."""
+
+    enabled: bool = True
+    cauchy: float = Field(4.0, gt=0.0, description='scale of the Cauchy loss in sigmas')
+
+
 class GravitySettings(Settings):
     """Accelerometer as gravity's direction, while the motion is quasi-static."""
 
@@ -292,6 +299,22 @@ class DoubtSettings(Settings):
     )
 
 
+class CalibrationSettings(Settings):
+    """Estimating what the robot departs from its description by, within its tolerances."""
+
+    enabled: bool = Field(True, description='whether constants of the robot are estimated')
+    period: float = Field(
+        1.0, gt=0.0, description='time between two changes of what measurements are taken for [s]'
+    )
+    least: float = Field(
+        0.3,
+        ge=0.0,
+        le=1.0,
+        description='share of its tolerance down to which a constant can be known: what the model '
+        'misses does not average out',
+    )
+
+
 class EstimatorSettings(Settings):
     """The sliding-window filter."""
 
@@ -320,12 +343,14 @@ class EstimatorSettings(Settings):
     gyro: GyroSettings = GyroSettings()
     strain: StrainSettings = StrainSettings()
     tracker: TrackerSettings = TrackerSettings()
+    base: BaseSettings = BaseSettings()
     gravity: GravitySettings = GravitySettings()
     field: FieldSettings = FieldSettings()
     solver: SolverSettings = SolverSettings()
     recovery: RecoverySettings = RecoverySettings()
     health: HealthSettings = HealthSettings()
     doubts: DoubtSettings = DoubtSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
 
 
 def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSettings:

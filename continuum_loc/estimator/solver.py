@@ -110,6 +110,9 @@ def _move(window: Window, offsets: list[np.ndarray]) -> int:
     """Take the offsets, relinearise columns that moved far; the first interval affected."""
     first = len(window.intervals)
     moves = np.abs(_by_node(window, offsets)[:, :, POSE_PART]).max(axis=(1, 2))
+    if window.grid.frames:
+        frames = np.array(offsets)[:, window.grid.frame_rows]
+        moves = np.maximum(moves, np.abs(frames).max(axis=1))
     far = moves >= window.settings.solver.relinearise
     for k, offset in enumerate(offsets):
         if (k == 0 and window.pinned) or not far[k]:

@@ -1,9 +1,10 @@
 """
 The state on its grid of times and arclengths.
 
-A *column* is the whole body at one knot time: N nodes of {T_map_body, strain, velocity} and a gyro
-bias for each IMU. Its tangent vector has 18 N + 3 I entries: node n at 18 n as [pose 6, strain 6,
-velocity 6], then the biases. Pose perturbations act on the right.
+A *column* is the whole body at one knot time: N nodes of {T_map_body, strain, velocity}, a gyro
+bias for each IMU, and where the frame lies in which a carried base is measured (F = 1, else 0).
+Its tangent vector has 18 N + 3 I + 6 F entries: node n at 18 n as [pose 6, strain 6, velocity 6],
+then the biases, then the frame. Pose perturbations act on the right.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ class Grid:
     no farther apart than `spacing`.
 
     s: (N,) arclengths [m]; steps: (N - 1,) whether strain may step in a segment; ring_nodes:
-    (R + 1,) nodes of the base and of the rings; biases: number of IMUs; dim: length of a column's
-    tangent vector.
+    (R + 1,) nodes of the base and of the rings; biases: number of IMUs; frames: 1 where the base
+    is measured, else 0; dim: length of a column's tangent vector.
     """
 
     def __init__(self, robot: RobotDescription, spacing: float):
@@ -52,8 +53,11 @@ class Grid:
         self.ring_nodes = np.array([self.node_at(s) for s in (0.0, *robot.ring_arclengths)])
         self.nodes = len(self.s)
         self.biases = len(robot.imu)
-        self.dim = NODE_DIM * self.nodes + 3 * self.biases
+        self.frames = int(robot.base.mode == 'measured')
         self.bias_offset = NODE_DIM * self.nodes
+        self.frame_offset = self.bias_offset + 3 * self.biases
+        self.dim = self.frame_offset + 6 * self.frames
+        self.frame_rows = slice(self.frame_offset, self.dim)
 
     def node_at(self, s: float) -> int:
         """Return the node at arclength s [m]; every ring has one."""
@@ -78,7 +82,8 @@ class Column(NamedTuple):
     """
     The body at one knot.
 
-    time [s] since the epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3).
+    time [s] since the epoch, T (N, 4, 4), strain (N, 6), velocity (N, 6), bias (I, 3),
+    T_map_frame (F, 4, 4).
     """
 
     time: float
@@ -86,17 +91,13 @@ class Column(NamedTuple):
     strain: np.ndarray
     velocity: np.ndarray
     bias: np.ndarray
+    T_map_frame: np.ndarray
 
     def retract(self, delta: np.ndarray) -> Column:
-        """Move the column by a tangent vector (18 N + 3 I,)."""
-        T, strain, velocity, bias = (
-            self.T.copy(),
-            self.strain.copy(),
-            self.velocity.copy(),
-            self.bias.copy(),
-        )
-        _retract(T, strain, velocity, bias, delta)
-        return Column(self.time, T, strain, velocity, bias)
+        """Move the column by a tangent vector (18 N + 3 I + 6 F,)."""
+        moved = Column(self.time, *(part.copy() for part in self[1:]))
+        _retract(moved, delta)
+        return moved
 
     def predict(self, dt: float) -> Column:
         """Predict the column dt later at constant body-frame velocity: the prior's mean."""
@@ -106,24 +107,37 @@ class Column(NamedTuple):
             self.strain.copy(),
             self.velocity.copy(),
             self.bias.copy(),
+            self.T_map_frame.copy(),
         )
 
 
 @kernel
-def _retract(T, strain, velocity, bias, delta):
+def _retract(column, delta):
+    """Move a column of one's own in place."""
     step, moved = np.empty((4, 4)), np.empty((4, 4))
-    nodes = T.shape[0]
+    nodes, biases = column.T.shape[0], column.bias.shape[0]
     for n in range(nodes):
         first = NODE_DIM * n
         lie_kernels.exp(delta[first:][:6], step)
-        lie_kernels.compose(T[n], step, moved)
-        T[n] = moved
+        lie_kernels.compose(column.T[n], step, moved)
+        column.T[n] = moved
         for i in range(6):
-            strain[n, i] += delta[first + STRAIN + i]
-            velocity[n, i] += delta[first + VELOCITY + i]
-    for m in range(bias.shape[0]):
+            column.strain[n, i] += delta[first + STRAIN + i]
+            column.velocity[n, i] += delta[first + VELOCITY + i]
+    for m in range(biases):
         for i in range(3):
-            bias[m, i] += delta[NODE_DIM * nodes + 3 * m + i]
+            column.bias[m, i] += delta[NODE_DIM * nodes + 3 * m + i]
+    for f in range(column.T_map_frame.shape[0]):
+        first = frame_row(column)
+        lie_kernels.exp(delta[first:][:6], step)
+        lie_kernels.compose(column.T_map_frame[f], step, moved)
+        column.T_map_frame[f] = moved
+
+
+@kernel
+def frame_row(column):
+    """First of the six rows of a column's frame."""
+    return NODE_DIM * column.T.shape[0] + 3 * column.bias.shape[0]
 
 
 @kernel
@@ -178,12 +192,18 @@ def column_at_rest(
     strain: np.ndarray,
     time: float,
     bias: np.ndarray | None = None,
+    T_map_frame: np.ndarray | None = None,
 ) -> Column:
-    """Make a motionless column with the given strain (N, 6), and gyro biases (I, 3) if not 0."""
+    """
+    Make a motionless column with the given strain (N, 6).
+
+    Gyro biases (I, 3) are none and T_map_frame (F, 4, 4) is `map` where they are not given.
+    """
     return Column(
         time,
         shape_from_strain(T_map_base, grid.s, strain),
         strain.copy(),
         np.zeros_like(strain),
         np.zeros((grid.biases, 3)) if bias is None else bias.copy(),
+        np.tile(np.eye(4), (grid.frames, 1, 1)) if T_map_frame is None else T_map_frame.copy(),
     )

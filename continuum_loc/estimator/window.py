@@ -9,6 +9,7 @@ the window moves on; the point at which that happened is pinned (first-estimate 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 
@@ -26,6 +27,9 @@ from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid, TIME_EPSILON
 import numpy as np
 
+# Told of an interval, its columns and the chain before the older column is marginalised.
+Forgetting = Callable[[Interval, Column, Column, Chain], None]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
@@ -37,6 +41,7 @@ class Kept:
     chain: Chain
     pinned: bool
     moving: bool
+    first: Column
 
 
 class Window:
@@ -53,8 +58,11 @@ class Window:
         self.offsets: list[np.ndarray] = []
         self.intervals: list[Interval] = []
         self.chain: Chain | None = None
+        self.on_forgetting: Forgetting | None = None
         self.pinned = self._moving = False
         self._bias: tuple[np.ndarray, np.ndarray] | None = None
+        self._first: Column | None = None  # what the prior of the start is about
+        self.wandered = False  # once the body was found: what was known of its base is outdated
 
     def start(self, column: Column) -> None:
         """Begin with one column at rest."""
@@ -85,7 +93,10 @@ class Window:
         changed = oldest.changed
         if changed:
             oldest.linearise(self.priors, self.columns[0], self.columns[1])
-        self.chain.forget_oldest(oldest.normal, changed)
+        self.chain.make_oldest_ready(oldest.normal, changed)
+        if self.on_forgetting is not None:
+            self.on_forgetting(oldest, self.columns[0], self.columns[1], self.chain)
+        self.chain.forget_oldest()
         del self.columns[0], self.offsets[0], self.intervals[0]
         self.pinned = True
 
@@ -95,7 +106,7 @@ class Window:
 
         `moving` says that the body may be in motion there.
         """
-        self._moving, self.pinned = moving, False
+        self._moving, self.pinned, self._first = moving, False, self.columns[0]
         self.chain = Chain(self.grid.dim, self._start())
         self.mark_changed()
 
@@ -121,13 +132,14 @@ class Window:
             self.chain,
             self.pinned,
             self._moving,
+            self._first,
         )
 
     def restore(self, kept: Kept) -> None:
         """Go back to a snapshot; intervals were linearised elsewhere since, so solve again."""
         self.columns, self.offsets = list(kept.columns), list(kept.offsets)
         self.intervals, self.chain = list(kept.intervals), kept.chain
-        self.pinned, self._moving = kept.pinned, kept.moving
+        self.pinned, self._moving, self._first = kept.pinned, kept.moving, kept.first
         self.mark_changed()
 
     def place(self, shape: Column) -> None:
@@ -150,10 +162,10 @@ class Window:
         self.chain.marginals[0] = self._start()
 
     def _start(self) -> Normal:
-        start = self.priors.start(self.columns[0], self._moving)
+        start = self.priors.start(self.columns[0], self._first, self._moving, self.wandered)
         if self._bias is not None:
             weight, mean = self._bias
-            at = np.arange(self.grid.bias_offset, self.grid.dim)
+            at = np.arange(self.grid.bias_offset, self.grid.frame_offset)
             start.H[at, at] += weight
             start.g[at] += weight * (self.columns[0].bias.ravel() - mean)
         return start

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
+from continuum_loc.formats.shapes import finite_rows
 from continuum_loc.mapping.grid import spatial_order
 from continuum_loc.mapping.prior_map import PriorMap
 import numpy as np
@@ -23,7 +24,6 @@ def sample_mesh(
     spacing: float | None = None,
     count: int | None = None,
     seed: int = 0,
-    region: tuple[np.ndarray, np.ndarray] | None = None,
     sigma: float = 1e-4,
     source: str = 'mesh',
     notes: tuple[str, ...] = (),
@@ -37,24 +37,18 @@ def sample_mesh(
     than `spacing` [m]; or give `count`, about as many points as wanted. The two sides of a thin
     part are sampled independently, and normals are the triangles' own: PCA mixes the sides of a
     thin blade up.
-    region: (lower, upper) corners of a box [m] to which the map is confined. source, notes: of
-    the map.
+    source, notes: of the map.
     """
     vertices, faces = _checked_mesh(vertices, faces, source)
     areas, normals = _triangle_areas_and_normals(vertices, faces)
-    inside = areas > 0.0 if region is None else (areas > 0.0) & _touches(vertices[faces], *region)
-    if not inside.any():
-        raise MapError(
-            f'{source}: no triangle with an area{"" if region is None else " in the region"}'
-        )
-    faces, areas, normals = faces[inside], areas[inside], normals[inside]
+    proper = areas > 0.0
+    if not proper.any():
+        raise MapError(f'{source}: no triangle with an area')
+    faces, areas, normals = faces[proper], areas[proper], normals[proper]
     spacing = _spacing_for(areas.sum(), spacing, count, source)
     generator = np.random.default_rng(seed)
     wanted = int(np.ceil(CANDIDATES * areas.sum() / spacing**2)) + 16
     points, triangle = _uniform_on_triangles(vertices[faces], areas, wanted, generator)
-    if region is not None:
-        within = ((points >= region[0]) & (points <= region[1])).all(axis=1)
-        points, triangle = points[within], triangle[within]
     kept = _poisson_subset(points, normals[triangle], spacing)
     points, triangle = points[kept], triangle[kept]
     order = spatial_order(points, 4.0 * spacing)
@@ -89,10 +83,10 @@ def map_from_cloud(
     toward `viewpoint` (3,) [m]; without one their sign means nothing and the map says so. source,
     notes: of the map.
     """
-    points = _finite(points, 'points', source)
+    points = finite_rows(points, 'points', source)
     oriented = normals is not None or viewpoint is not None
     if normals is not None:
-        normals = _unit(_finite(normals, 'normals', source), source)
+        normals = _unit(finite_rows(normals, 'normals', source), source)
     if normals is None or planarity is None:
         alpha, directions = local_shape(points, normals)
         planarity = alpha if planarity is None else planarity
@@ -176,7 +170,7 @@ def _principal_shape(points, near, normals, part):
 
 
 def _checked_mesh(vertices, faces, source):
-    vertices = _finite(vertices, 'vertices', source)
+    vertices = finite_rows(vertices, 'vertices', source)
     faces = np.asarray(faces, dtype=np.int64)
     if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
         raise MapError(f'{source}: faces must be (F, 3) with F >= 1, got {faces.shape}')
@@ -186,19 +180,6 @@ def _checked_mesh(vertices, faces, source):
             f'there are {len(vertices)}'
         )
     return vertices, faces
-
-
-def _finite(rows, name, source):
-    rows = np.ascontiguousarray(rows, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0:
-        raise MapError(f'{source}: {name} must be (N, 3) with N >= 1, got {rows.shape}')
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(bad):
-        raise MapError(
-            f'{source}: {len(bad)} of {len(rows)} {name} are not finite, '
-            f'the first is number {bad[0]} (counted from 0); remove them or repair the file'
-        )
-    return rows
 
 
 def _unit(normals, source):
@@ -227,11 +208,6 @@ def _triangle_areas_and_normals(vertices, faces):
     doubled = np.cross(b - a, c - a)
     length = np.linalg.norm(doubled, axis=1)
     return 0.5 * length, doubled / np.where(length > 0.0, length, 1.0)[:, None]
-
-
-def _touches(corners, lower, upper):
-    """Whether the bounding boxes of triangles (F, 3, 3) meet the box."""
-    return ((corners.min(axis=1) <= upper) & (corners.max(axis=1) >= lower)).all(axis=1)
 
 
 def _uniform_on_triangles(corners, areas, count, generator):

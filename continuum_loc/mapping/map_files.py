@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 from pathlib import Path
 from typing import Any
 
 from continuum_loc.errors import MapError
+from continuum_loc.formats.content import bytes_of
+from continuum_loc.formats.reading import read_shape
+from continuum_loc.formats.shapes import Cloud
 from continuum_loc.mapping.build import map_from_cloud, sample_mesh
-from continuum_loc.mapping.formats.content import bytes_of
-from continuum_loc.mapping.formats.obj import read_obj
-from continuum_loc.mapping.formats.pcd import read_pcd
-from continuum_loc.mapping.formats.ply import read_ply
-from continuum_loc.mapping.formats.shapes import Cloud, Mesh
-from continuum_loc.mapping.formats.stl import read_stl
-from continuum_loc.mapping.formats.text import read_pts, read_text
 from continuum_loc.mapping.prior_map import NPZ_FORMAT, PriorMap
 from continuum_loc.npz_files import NotAnArchive, read_arrays
 import numpy as np
@@ -79,39 +74,6 @@ def load_map(
     return sample_mesh(
         shape.vertices * scale, shape.faces, seed=seed, **density, **where, **stated
     )
-
-
-def read_shape(path: Path) -> Cloud | Mesh:
-    """
-    Read a cloud or a mesh as the file has it, in its units.
-
-    Raises MapError naming the file, the place and what is valid.
-    """
-    suffixes = [suffix.lower() for suffix in path.suffixes]
-    suffix = suffixes[-1] if suffixes else ''
-    if suffix == '.gz':
-        suffix = suffixes[-2] if len(suffixes) > 1 else ''
-    if suffix not in READERS:
-        raise MapError(
-            f"{path}: a map cannot be read as '{suffix}'; valid are .npz, {', '.join(READERS)}"
-        )
-    try:
-        return READERS[suffix](bytes_of(path), str(path))
-    except MemoryError:
-        raise MapError(f'{path}: does not fit into memory') from None
-
-
-READERS: dict[str, Callable[[bytes, str], Cloud | Mesh]] = {
-    '.ply': read_ply,
-    '.pcd': read_pcd,
-    '.xyz': read_text,
-    '.txt': read_text,
-    '.asc': read_text,
-    '.csv': read_text,
-    '.pts': read_pts,
-    '.stl': read_stl,
-    '.obj': read_obj,
-}
 
 
 def _scaled(scale: float, notes: tuple[str, ...]) -> tuple[str, ...]:

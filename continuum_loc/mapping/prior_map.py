@@ -9,12 +9,12 @@ import json
 from pathlib import Path
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.ply import write_ply
+from continuum_loc.formats.ply_writer import write_ply
+from continuum_loc.formats.shapes import FARTHEST
 from continuum_loc.mapping.voxel_index import VoxelIndex
 import numpy as np
 
 CLOUD_COLUMNS = ('x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity')
-FARTHEST = 1e9  # m: of a coordinate; squares and cubes of it can still be computed with
 NPZ_FORMAT = 'continuum_loc prior map 1'
 
 

@@ -8,6 +8,7 @@ Points are sorted by block, a cube of some twenty of them; a hash table finds a 
 from __future__ import annotations
 
 from continuum_loc.errors import MapError
+from continuum_loc.formats.shapes import finite_rows
 from continuum_loc.mapping.grid import AXIS_BITS, hash_table, MORTON_BITS, morton_codes
 from continuum_loc.mapping.lookup import Lattice, nearest_facing_batch, VoxelArrays
 import numpy as np
@@ -32,8 +33,8 @@ class VoxelIndex:
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, edge: float | None = None):
-        points = _checked_rows(points, 'points')
-        normals = _checked_rows(normals, 'normals')
+        points = finite_rows(points, 'points', 'index')
+        normals = finite_rows(normals, 'normals', 'index')
         if normals.shape != points.shape:
             raise MapError(f'normals {normals.shape} must match points {points.shape}')
         extent = float(np.ptp(points, axis=0).max())
@@ -98,18 +99,6 @@ class VoxelIndex:
             distance2,
         )
         return found, np.sqrt(distance2)
-
-
-def _checked_rows(rows: np.ndarray, name: str) -> np.ndarray:
-    rows = np.ascontiguousarray(rows, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0:
-        raise MapError(f'{name} must be (P, 3) with P >= 1, got {rows.shape}')
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(bad):
-        raise MapError(
-            f'{name}: {len(bad)} of {len(rows)} rows are not finite, the first is row {bad[0]}'
-        )
-    return rows
 
 
 def _suitable_edge(points: np.ndarray, extent: float) -> float:

@@ -25,7 +25,7 @@ from msg_tools.convert import tracked_pose
 from msg_tools.factory import ros_messages
 from msg_tools.records import CloudRecord
 from msg_tools.results import columns_message, map_record, tip_message
-from msg_tools.topics import tip_of, TRACKER
+from msg_tools.topics import INPUTS, tip_of, TRACKER
 import numpy as np
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
@@ -37,7 +37,7 @@ POORLY_KNOWN = 0.05  # [m] a ring farther from known in some direction is told
 class EstimatorNode(WorkerNode):
     """The sliding-window filter on a graph."""
 
-    inputs = ('tof/points', 'imu/data_raw', 'imu/mag', 'strain', 'joint_states', TRACKER)
+    inputs = (*INPUTS, TRACKER)
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', EstimatorNodeSettings(), **options)

@@ -60,20 +60,20 @@ class SimulatorNode(PackageNode):
             raise self._failure
 
     def _world(self) -> Any:
-        from continuum_loc.simulator.scenes import load_scene
-        from continuum_loc.simulator.world import World
+        from continuum_loc.offline.trials import Trial, world
 
         s = self.settings
-        scene = None if s.scene == 'none' else load_scene(s.scene)
-        return World(
-            self.robot,
-            scene,
+        trial = Trial(
+            s.robot,
+            s.scene,
             s.trajectory,
-            plant=s.plant or None,
             profile=s.profile,
-            tof_fidelity=s.tof_fidelity,
+            fidelity=s.tof_fidelity,
             seed=s.seed,
+            plant=s.plant or None,
+            world=s.world,
         )
+        return world(trial)
 
     def _topics(self) -> list[str]:
         kinds = {
@@ -82,6 +82,7 @@ class SimulatorNode(PackageNode):
             'imu/mag': self.robot.hall,
             'strain': self.robot.strain,
             'joint_states': True,
+            'base/pose': self.robot.base.mode == 'measured',
             'ground_truth/poses': True,
         }
         return [topic for topic, present in kinds.items() if present] + [

@@ -24,6 +24,7 @@ KINDS = {  # topic -> what a filter counts it as
     'strain': 'StrainSample',
     'tracker/': 'TrackedPose',
     'joint_states': 'EncoderSample',
+    'base/': 'BaseSample',
 }
 TRUTH = 'ground_truth/poses'
 BAG = 'bag'  # for what is wrong with all of it
@@ -44,7 +45,8 @@ class Suspicion:
         """Take the next estimate: its suspects have been that since the one before."""
         step, self._last = estimate.stamp - self._last, estimate.stamp
         for name, reason in estimate.suspects.items():
-            kind = re.sub(r'\d+ ms ', '', reason)  # how late it is changes from step to step
+            # How late or how far off it is changes from step to step.
+            kind = re.sub(r'\d+ ms | \(.*\)', '', reason)
             self._seconds[name][kind] += step / NANOSECONDS if 0 < step <= LONGEST_STEP else 0.0
 
     def table(self) -> dict[str, dict[str, float]]:
@@ -101,6 +103,7 @@ def wanted_topics(robot: RobotDescription, settings: Any) -> list[str]:
         'strain': robot.strain is not None and on('strain'),
         'tracker/': robot.trackers and on('tracker'),
         'joint_states': robot.base.insertion.mode == 'measured' and hasattr(settings, 'tof'),
+        'base/': robot.base.mode == 'measured' and on('base'),
     }
     return [name for name, wanted in has.items() if wanted]
 
@@ -213,7 +216,7 @@ def _honesty(figure: float) -> str:
 
 
 def _is(name: str, topic: str) -> bool:
-    return name.startswith(topic) if topic == 'tracker/' else name == topic
+    return name.startswith(topic) if topic.endswith('/') else name == topic
 
 
 def _sum(counts: Mapping[str, int], topic: str) -> int:

@@ -23,8 +23,7 @@ from continuum_loc.offline.replay import place_points, ReplayResult, samples_of
 from continuum_loc.offline.replay import replay as run_replay
 from continuum_loc.offline.report import context_of, write_report
 from continuum_loc.offline.runs import distribution, load_run, new_run, save_run, summary_of
-from continuum_loc.offline.scene_maps import scene_map_file
-from continuum_loc.offline.trial_runs import configuration
+from continuum_loc.offline.trial_runs import configuration, trial_map_file
 from continuum_loc.offline.trials import Trial
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.trajectory import BASE, Trajectory
@@ -57,18 +56,11 @@ def run_demo(trial: Trial, root: Path, tell: Tell = print) -> DemoOutcome:
     robot = load_robot(trial.robot)
     settings = settings_of(robot.name)
     tell('building the scene and its prior map (kept for the next time)')
-    map_file = scene_map_file(trial.scene)
+    map_file = trial_map_file(trial)
     folder = new_run('demo', root)
     live = run_live(
         folder / 'live',
-        robot=trial.robot,
-        scene=trial.scene,
-        trajectory=trial.trajectory,
-        prior_map=map_file,
-        duration=trial.duration or 20.0,
-        seed=trial.seed,
-        profile=trial.profile,
-        tof_fidelity=trial.fidelity,
+        trial,
         progress=lambda stage, share: tell(f'{stage} {100 * share:.0f} %'),
     )
     bag = (folder / 'live' / 'bag').rename(folder / 'bag')

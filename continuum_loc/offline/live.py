@@ -20,9 +20,12 @@ from typing import Any
 
 from continuum_loc.errors import LiveError
 from continuum_loc.offline.domain import Domain
+from continuum_loc.offline.trial_runs import trial_map_file
+from continuum_loc.offline.trials import Trial
 
 START_LIMIT = 180.0  # s; the first run compiles
 STOP_LIMIT = 30.0
+DURATION = 20.0  # s of a trial that has none of its own
 POLL = 0.1
 
 
@@ -122,45 +125,40 @@ class _Process:
 
 def run_live(
     folder: str | Path,
+    trial: Trial,
     *,
-    robot: str = 'engine',
-    scene: str = 'S0',
-    trajectory: str = 't1',
-    prior_map: str | Path = '',
-    duration: float = 20.0,
-    seed: int = 0,
-    profile: str = 'live',
-    tof_fidelity: str = 'paper',
-    settings: str = '',
     record: bool = True,
     progress: Callable[[str, float], None] | None = None,
     watch: Callable[[dict[str, int]], None] | None = None,
 ) -> LiveResult:
     """
-    Simulate, estimate and record live over real ROS 2, `duration` seconds of data.
+    Simulate, estimate and record a trial live over real ROS 2 (20 s where it has no duration).
 
     The bag is `folder`/bag; `record` says whether there is one.
     The graph has a ROS domain that nobody else uses (`Domain`).
-    robot, scene, prior_map, settings: bundled names or files. progress(stage, share): called as it
-    goes on, share in [0, 1]. watch(process ids by node): called ten times a second while data
-    flows. Raises LiveError where a node fails; no process is left behind.
+    progress(stage, share): called as it goes on, share in [0, 1]. watch(process ids by node):
+    called ten times a second while data flows. Raises LiveError where a node fails; no process is
+    left behind.
     """
+    duration = DURATION if trial.duration is None else trial.duration
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda stage, share: None)
     with _Graph(folder) as graph:
         tell('starting the nodes', 0.0)
-        listeners = _listeners(graph, record, robot, prior_map, settings)
+        listeners = _listeners(graph, record, trial)
         # The simulator holds its data back until all of them listen to it.
         simulator = graph.start(
             'simulator',
-            robot=robot,
-            scene=scene,
-            trajectory=trajectory,
+            robot=trial.robot,
+            plant=trial.plant or '',
+            scene=trial.scene,
+            trajectory=trial.trajectory,
             duration=float(duration),
-            seed=seed,
-            profile=profile,
-            tof_fidelity=tof_fidelity,
+            seed=trial.seed,
+            profile=trial.profile,
+            tof_fidelity=trial.fidelity,
+            world=trial.world,
             wait_for=len(listeners),
         )
         _follow(simulator, listeners, duration, tell, watch)
@@ -197,18 +195,15 @@ class _Graph:
         return self.started[-1]
 
 
-def _listeners(
-    graph: _Graph, record: bool, robot: str, prior_map: str | Path, settings: str
-) -> list[_Process]:
+def _listeners(graph: _Graph, record: bool, trial: Trial) -> list[_Process]:
     """Start what listens to the sensors: the recorder, where one is wanted, and the estimator."""
     # The simulator publishes reliably, so on a busy machine nothing need be lost on the way.
     bag = str(graph.folder / 'bag')
     listeners = [graph.start('recorder', bag=bag, reliable_inputs=True)] if record else []
     estimator = graph.start(
         'estimator',
-        robot=robot,
-        map=str(prior_map),
-        settings=settings,
+        robot=trial.robot,
+        map=str(trial_map_file(trial)),
         **{'intake.reliable_inputs': True},
     )
     for recorder in listeners:

@@ -18,6 +18,7 @@ from continuum_loc.errors import BagError, MessageError
 from continuum_loc.estimate import Estimate
 from continuum_loc.intake import Intake
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -39,7 +40,16 @@ from msg_tools.topics import INPUTS, topic_of, TRACKER
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-SAMPLES = (TofFrame, ImuSample, StrainSample, FieldSample, TrackedPose, EncoderSample, TruthSample)
+SAMPLES = (
+    TofFrame,
+    ImuSample,
+    StrainSample,
+    FieldSample,
+    TrackedPose,
+    EncoderSample,
+    BaseSample,
+    TruthSample,
+)
 CLOUD_PERIOD = NANOSECONDS // 4  # of each sensor, one frame in this time is kept for pictures
 
 

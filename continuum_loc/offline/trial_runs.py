@@ -10,7 +10,6 @@ from continuum_loc.offline.localise import make_filter, trial_settings
 from continuum_loc.offline.replay import replay, ReplayResult
 from continuum_loc.offline.scene_maps import MAP_POINTS, scene_map_file
 from continuum_loc.offline.trials import simulate, Trial
-from continuum_loc.robot import load_robot
 
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
@@ -18,16 +17,17 @@ if TYPE_CHECKING:
 
 def run_trial(trial: Trial, settings: EstimatorSettings | None = None) -> ReplayResult:
     """Simulate and estimate, both in this thread; only the estimator is timed."""
-    robot = load_robot(trial.robot)
     return replay(
         simulate(trial),
-        make_filter(robot, load_map(trial_map_file(trial)), settings or trial_settings(trial)),
+        make_filter(
+            trial.description, load_map(trial_map_file(trial)), settings or trial_settings(trial)
+        ),
     )
 
 
 def trial_map_file(trial: Trial) -> Path:
     """Name the file of the prior map that the estimator is given in a trial."""
-    from continuum_loc.offline.disturbed import scanned_map_file
+    from continuum_loc.offline.scanned_maps import scanned_map_file
 
     nominal = scene_map_file(trial.map_scene or trial.scene)
     departures = trial.departures
@@ -37,7 +37,7 @@ def trial_map_file(trial: Trial) -> Path:
 def configuration(trial: Trial, **more: Any) -> dict[str, Any]:
     """Everything that a trial was made from, for its run folder; `more` adds to it."""
     return {
-        'robot': load_robot(trial.robot),
+        'robot': trial.description,
         'scene': trial.scene,
         'trajectory': trial.trajectory,
         'map': {'scene': trial.map_scene or trial.scene, 'points': MAP_POINTS},

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import hashlib
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from continuum_loc import lie
 from continuum_loc.measurements import Measurement, TruthSample
@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from continuum_loc.simulator.departures import Departures
+    from continuum_loc.simulator.scene import Scene
     from continuum_loc.simulator.world import World
 
 # What a disturbed trial gets, 1 sigma per axis and sensor, but for the offset, which all ToF
@@ -29,6 +30,29 @@ if TYPE_CHECKING:
 MOUNTING_ERROR = (0.002, 1.0)  # m, deg
 GYRO_BIAS = 0.01  # rad/s
 TOF_CLOCK_OFFSET = 0.010  # s
+NOWHERE = 'none'  # a scene of empty space, without ToF frames
+
+# What a trial's description says of the base, and what a trial's carrier tells of it.
+BASES: dict[str, dict[str, Any]] = {
+    'fixed': {'mode': 'fixed'},
+    'measured': {
+        'mode': 'measured',
+        'sigma_position': 0.001,
+        'sigma_rotation_deg': 0.2,
+        'measurement': {'sigma_position': 0.0002, 'sigma_rotation_deg': 0.02},
+    },
+    'odometry': {
+        'mode': 'measured',
+        'measurement': {
+            'frame': 'odom',
+            'drift': 0.05,
+            'sigma_position': 0.0002,
+            'sigma_rotation_deg': 0.02,
+        },
+    },
+    'free': {'mode': 'free'},
+}
+TOLD = {'arm': {'latency': 0.010}, 'odometry': {'drift': 0.05}}
 
 
 @dataclass(frozen=True)
@@ -42,6 +66,8 @@ class Trial:
     disturbed: mounting errors, gyro biases and a clock offset that the estimator does not know.
     world: `ideal`, or a file of true departures (`simulator.departures`), which also says what ToF
     sensors it has; the prior map departs with it.
+    carried: what carries the base, of the robot's carriers; empty: it stands. told: how that tells
+    where it is, of TOLD; base: what the description says of it, of BASES; empty: as it is.
     drawn_base: the base sits where a draw from the description's own spread puts it, not where
     the description says: what a covariance that counts with this spread has to be judged by.
     duration: seconds; None for the trajectory's own.
@@ -59,6 +85,9 @@ class Trial:
     duration: float | None = None
     plant: str | None = None
     world: str = 'ideal'
+    carried: str = ''
+    told: str = 'arm'
+    base: str = ''
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'fidelity', self.departures.fidelity(self.fidelity))
@@ -87,6 +116,7 @@ class Trial:
                 + ['drawn'] * self.drawn_base
                 + [f'world_{_world_name(self.world)}'] * (self.world != 'ideal')
                 + [Path(self.plant or '').stem] * bool(self.plant)
+                + [f'{self.carried}_{self.told}'] * bool(self.carried)
             )
             + f'-{self.seed}{length}'
         )
@@ -94,7 +124,15 @@ class Trial:
     @property
     def name(self) -> str:
         """Name the trial, uniquely among trials."""
-        return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}'
+        base = f'-base_{self.base}' * bool(self.base)
+        return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}{base}'
+
+    @property
+    def description(self) -> RobotDescription:
+        """What the estimator is told of the robot."""
+        return (
+            with_base(load_robot(self.robot), self.base) if self.base else load_robot(self.robot)
+        )
 
 
 def _world_name(world: str) -> str:
@@ -111,25 +149,15 @@ def world(trial: Trial, faults: tuple = ()) -> World:
     from continuum_loc.simulator.world import World
 
     robot = load_robot(trial.robot)
+    if trial.carried:
+        return _carried(trial, robot, faults)
     if trial.drawn_base:
         robot = _base_drawn(robot, trial.seed)
     if trial.disturbed:
         robot, faults = _disturbed(robot, trial.seed, faults)
-    scene = load_scene(trial.scene) if robot.tof else None
+    scene = load_scene(trial.scene) if robot.tof and trial.scene != NOWHERE else None
     if trial.world != 'ideal':
-        from continuum_loc.offline.disturbed import true_world
-
-        return true_world(
-            robot,
-            scene,
-            trial.trajectory,
-            trial.departures,
-            seed=trial.seed,
-            fidelity=trial.fidelity,
-            plant=trial.plant,
-            profile=trial.profile,
-            faults=faults,
-        )
+        return _true_world(robot, scene, trial, faults)
     return World(
         robot,
         scene,
@@ -139,6 +167,62 @@ def world(trial: Trial, faults: tuple = ()) -> World:
         tof_fidelity=trial.fidelity,
         seed=trial.seed,
         faults=faults,
+    )
+
+
+def with_base(robot: RobotDescription, name: str) -> RobotDescription:
+    """Make of a robot one of whose base the description says what BASES has under a name."""
+    base = type(robot.base).model_validate(robot.base.model_dump() | BASES[name])
+    return robot.model_copy(update={'base': base})
+
+
+def _carried(trial: Trial, robot: RobotDescription, faults: tuple) -> World:
+    """Make the world of a trial on a base that is carried, and tells where it is."""
+    from continuum_loc.simulator.carrier import carrier, Told
+    from continuum_loc.simulator.scenes import load_scene
+    from continuum_loc.simulator.world import World
+
+    robot = with_base(robot, 'odometry' if trial.told == 'odometry' else 'measured')
+    return World(
+        robot,
+        load_scene(trial.scene) if robot.tof and trial.scene != NOWHERE else None,
+        trial.trajectory,
+        plant=trial.plant,
+        profile=trial.profile,
+        tof_fidelity=trial.fidelity,
+        seed=trial.seed,
+        faults=faults,
+        carried=carrier(trial.carried, robot, Told(**TOLD[trial.told])),
+    )
+
+
+def _true_world(
+    robot: RobotDescription, scene: Scene | None, trial: Trial, faults: tuple
+) -> World:
+    """
+    Make the world of a trial as it truly is, of a robot as it is described.
+
+    The drives pull as the nominal plant has it: what the true one does with that is its own. The
+    estimator gets the nominal robot and its own settings, and nothing of what is drawn here.
+    """
+    from continuum_loc.simulator import departures as true
+    from continuum_loc.simulator.plant import load_plant
+    from continuum_loc.simulator.trajectories import trajectory as path_of
+    from continuum_loc.simulator.world import World
+
+    departures, fidelity, seed = trial.departures, trial.fidelity, trial.seed
+    nominal = load_plant(trial.plant or robot.name)
+    return World(
+        true.true_robot(robot, departures, seed),
+        scene,
+        path_of(trial.trajectory, robot, nominal),
+        plant=true.true_plant(nominal, departures, seed),
+        profile=trial.profile,
+        tof_fidelity=fidelity,
+        tof_settings=true.tof_settings(departures, fidelity),
+        T_magnet_true=true.magnet_error(departures, seed),
+        seed=seed,
+        faults=(*faults, *true.sensor_departures(robot, departures, fidelity, seed)),
     )
 
 

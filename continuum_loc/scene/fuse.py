@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.ply import write_ply
+from continuum_loc.formats.ply_writer import write_ply
 from continuum_loc.scene.reconstruct import Reconstruction
 from continuum_loc.settings import Settings
 import numpy as np

@@ -15,7 +15,7 @@ from continuum_loc import lie
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
 from continuum_loc.extras import require
-from continuum_loc.mapping.ply import write_ply
+from continuum_loc.formats.ply_writer import write_ply
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
 from continuum_loc.robot import RobotDescription
 from continuum_loc.trajectory import Trajectory

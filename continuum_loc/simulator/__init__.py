@@ -1,8 +1,4 @@
-"""
-The simulated robot in its scene.
-
-`World` drives it and yields what its sensors measure, with the truth.
-"""
+"""The simulated robot in its scene: `World` yields what its sensors measure, and the truth."""
 
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """
-Scenes R0-R4: the inside of a 70 x 70 x 60 cm box in which the soft arm hangs.
-
-There are none to four objects in it.
+Scenes R0-R4: the box of 70 x 70 x 60 cm in which the soft arm hangs, with none to four objects.
 
 The floor is z = 0, the arm comes through a hole in the middle of the ceiling. Objects stand round
 its working space.
@@ -63,11 +61,7 @@ def _slabs() -> list[Manifold]:
 
 
 def _mustard() -> Part:
-    """
-    Make a squeeze bottle, 6 x 10 x 19 cm.
-
-    An oval body that narrows to a shoulder, and a round cap.
-    """
+    """Make a squeeze bottle of 6 x 10 x 19 cm: oval, narrow at the shoulder, with a round cap."""
     heights = np.array([0.0, 0.008, 0.05, 0.10, 0.125, 0.145, 0.155])
     half_width = np.array([0.042, 0.047, 0.048, 0.047, 0.042, 0.026, 0.016])
     half_depth = np.array([0.024, 0.029, 0.030, 0.029, 0.026, 0.020, 0.016])
@@ -96,11 +90,7 @@ def _cracker_box() -> Part:
 
 
 def _sign() -> Part:
-    """
-    Make a folded wet-floor sign, 40 cm high.
-
-    Two boards that lean on one another, with a grip on top.
-    """
+    """Make a folded wet-floor sign, 40 cm high: two boards lean on one another below a grip."""
     height, spread, lean = 0.38, 0.20, np.degrees(np.arctan2(0.095, 0.38))
     board = box((0.006, 0.20, height / np.cos(np.radians(lean)))).rotate((0.0, lean, 0.0))
     left = board.translate((-spread / 4, 0.0, height / 2))

@@ -189,9 +189,7 @@ def _exits(normal, centre, outward, offset):
 @kernel
 def _all_near(triangles, faces, low, high, tolerance):
     """
-    Tell whether triangles (T, 3, 3) lie within `tolerance` of faces (F, 3, 3).
-
-    low, high: (F, 3) bounds of the faces.
+    Tell whether triangles (T, 3, 3) lie within `tolerance` of faces (F, 3, 3) in bounds low, high.
 
     The distance to one face is a convex function, greatest at a corner: a triangle whose corners
     are all near one and the same face is near it everywhere. One that is not is divided, down to

@@ -140,7 +140,7 @@ class HallErrors(_Departure):
     """
     Hall sensors with scales, axes and offsets of their own, which drift while they warm up.
 
-    An axis that is saturated stays so.
+    What is saturated stays so.
     """
 
     scale: float = 0.0

@@ -151,11 +151,7 @@ class Departures(Settings):
         return tuple(name for name in Departures.model_fields if getattr(self, name) is not None)
 
     def only(self, *names: str) -> Departures:
-        """
-        Leave all parts but some out.
-
-        Raises SettingsError for a name that is no part, or not of this world.
-        """
+        """Leave all parts but some out. Raises SettingsError for a name that is no part of it."""
         for name in names:
             if name not in self.parts:
                 raise SettingsError(

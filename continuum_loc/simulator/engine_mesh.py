@@ -60,7 +60,7 @@ class BladeRow:
     """
     A row of identical blades.
 
-    They are twisted as tan(stagger) proportional to radius (rotors) or constant (vanes).
+    Rotors are twisted as tan(stagger) proportional to radius, vanes are not twisted.
     """
 
     name: str
@@ -113,11 +113,7 @@ class BladeRow:
 
 
 def _gap_at_top(count: int) -> float:
-    """
-    Azimuth [deg] of the first blade that leaves a gap centred on azimuth 0.
-
-    The gap is the robot's way in.
-    """
+    """Azimuth [deg] of the first blade: the gap for the robot is then at azimuth 0."""
     return 180.0 / count
 
 
@@ -138,11 +134,7 @@ def engine_parts() -> list[Part]:
 
 
 def leading_edge(blade: str, radius: float) -> np.ndarray:
-    """
-    (3,) point on the leading edge of a blade (`rotor1_0`).
-
-    At a distance [m] from the engine's axis.
-    """
+    """(3,) point on a blade's (`rotor1_0`) leading edge, `radius` [m] from the axis."""
     sections = _find_row(blade).sections(_index(blade))
     edge = 0.5 * (sections[:, 0] + sections[:, -1])
     radii = np.hypot(edge[:, 1], edge[:, 2])
@@ -151,9 +143,7 @@ def leading_edge(blade: str, radius: float) -> np.ndarray:
 
 def bitten(blade: Part, radius: float, size: float) -> tuple[Part, Manifold]:
     """
-    Blade with a round bite of diameter `size` [m] out of its edge, and the piece that went.
-
-    The bite is in the leading edge.
+    Blade with a round bite of diameter `size` [m] in its leading edge, and the piece that went.
 
     The contact pieces are re-cut finely, so that the robot feels the gap to about a centimetre.
     """
@@ -177,8 +167,7 @@ def _section(chord: float, camber: float, thickness: float) -> tuple[np.ndarray,
     """
     Draw a cambered NACA four-digit-like section about mid-chord.
 
-    (2n,) axial and tangential coordinates: the suction side from nose to tail, then the pressure
-    side back.
+    (2n,) axial and tangential coordinates: to the tail on the suction side, back on the other.
     """
     u = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, _SECTION_POINTS)))
     half = (
@@ -202,11 +191,7 @@ def _blade(row: BladeRow, index: int) -> Part:
 
 
 def _blade_hulls(sections: np.ndarray, chord_pieces: int = 2, span_pieces: int = 5) -> Hulls:
-    """
-    Convex pieces: the loft sliced along span and chord.
-
-    Twist and camber make the whole blade concave.
-    """
+    """Convex pieces along span and chord: twist and camber make a blade concave."""
     side = sections.shape[1] // 2
     upper, lower = sections[:, :side], sections[:, side:][:, ::-1]
     return tuple(
@@ -269,11 +254,7 @@ def _hub() -> Part:
 
 
 def _hub_hulls(stations: np.ndarray) -> Hulls:
-    """
-    Take the upper part of the hub.
-
-    It is convex over the nose, and over each conical piece behind it.
-    """
+    """Convex pieces of the hub: its nose, and each of the cones behind it."""
     azimuths = np.radians(np.linspace(-_CONTACT_AZIMUTH, _CONTACT_AZIMUTH, 51))
     nose = stations[stations <= _NOSE_END + 1e-9]
     last = len(nose) - 1

@@ -37,11 +37,7 @@ _EMBED = 0.004
 
 @dataclass(frozen=True)
 class Left:
-    """
-    An object lying on the hub or stuck to the casing at (x, azimuth).
-
-    It is turned about the wall's normal.
-    """
+    """An object on the hub or stuck to the casing at (x, azimuth), turned about the normal."""
 
     what: str
     wall: str
@@ -180,11 +176,7 @@ def _apply(change: Change, parts: dict[str, Part]) -> Manifold:
 
 
 def _anomaly(change: Change, body: Manifold, as_built: Manifold, changed: Manifold) -> Anomaly:
-    """
-    Keep what of `body` only one of the two scenes has.
-
-    What sinks into a wall makes no difference.
-    """
+    """Keep what of `body` only one scene has: what sinks into a wall does not count."""
     if isinstance(change, Left | Lodged):
         return Anomaly(change.what, 'added', *mesh_of(_largest(body - as_built)))
     name = change.part if isinstance(change, Gone) else f'{change.blade}_edge'
@@ -192,11 +184,7 @@ def _anomaly(change: Change, body: Manifold, as_built: Manifold, changed: Manifo
 
 
 def _largest(solid: Manifold) -> Manifold:
-    """
-    Keep the largest connected piece.
-
-    Subtraction leaves slivers where faceted surfaces nearly coincide.
-    """
+    """Keep the largest connected piece, without the slivers that subtraction leaves."""
     return max(solid.decompose(), key=lambda piece: piece.volume())
 
 

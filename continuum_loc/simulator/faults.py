@@ -1,7 +1,5 @@
 """
-Faults on request: each wraps a stream of samples and yields the faulty stream.
-
-The samples come from the simulator or from a bag.
+Faults on request: each wraps the samples of a simulator or a bag and yields faulty ones.
 
     faulty = Dropout(sensors=("ring2_*",), probability=0.3, seed=1)(samples)
 
@@ -22,6 +20,7 @@ from typing import Any
 
 from continuum_loc import lie
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -38,18 +37,19 @@ import numpy as np
 
 
 def source(sample: Any) -> str:
-    """Name of what a sample comes from: its sensor, else `strain`, `joint_states` or `truth`."""
-    kinds = {StrainSample: 'strain', EncoderSample: 'joint_states', TruthSample: 'truth'}
+    """Name what a sample comes from: a sensor, `strain`, `joint_states`, `base`, `truth`."""
+    kinds = {
+        StrainSample: 'strain',
+        EncoderSample: 'joint_states',
+        BaseSample: 'base',
+        TruthSample: 'truth',
+    }
     return kinds.get(type(sample)) or sample.sensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """
-    Base: applies `alter` to the chosen sensors' samples in [start, end).
-
-    `alter` returns what goes on, or None.
-    """
+    """Base of all: `alter` changes samples of chosen sensors in [start, end), or drops them."""
 
     sensors: tuple[str, ...] = ('*',)
     start: float = 0.0
@@ -84,11 +84,7 @@ class Fault:
         return any(fnmatchcase(source(sample), pattern) for pattern in self.sensors)
 
     def alter(self, sample: Any, rng: np.random.Generator, memory: dict[str, Any]) -> Any | None:
-        """
-        Return the faulty sample.
-
-        `memory` holds each source's last sample from before the fault.
-        """
+        """Return the faulty sample; `memory` holds each source's last one before the fault."""
         raise NotImplementedError
 
 
@@ -113,11 +109,7 @@ class Freeze(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class BiasStep(Fault):
-    """
-    A constant is added from `start` on.
-
-    rad/s on gyros, m/s^2 on accelerometers, T on Hall sensors.
-    """
+    """From `start` on a constant is added [rad/s, m/s^2, T]."""
 
     gyro: tuple[float, float, float] = (0.0, 0.0, 0.0)
     accelerometer: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -140,9 +132,8 @@ class Outliers(Fault):
     """
     Each valid ToF zone, with `probability`, reads a range drawn evenly from `ranges` [m].
 
-    It is still called valid.
-
-    IMU samples get, with the same probability, a spike of `gyro_spike` rad/s about a random axis.
+    It is still called valid. IMU samples get, with the same probability, a spike of `gyro_spike`
+    rad/s about a random axis.
     """
 
     probability: float = 0.05
@@ -169,11 +160,7 @@ class Outliers(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class ClockOffset(Fault):
-    """
-    A wrong clock.
-
-    Stamps are late by `offset` s, `jitter` s (1 sigma) and `drift` s/s since `start`.
-    """
+    """A wrong clock: stamps are late by `offset` s, `jitter` s (1 sigma), `drift` in s/s."""
 
     offset: float = 0.0
     jitter: float = 0.0
@@ -187,11 +174,7 @@ class ClockOffset(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class Delay(Fault):
-    """
-    Samples arrive late, with their stamps right.
-
-    By `delay` s, give or take `jitter` s (1 sigma, never early).
-    """
+    """Samples with right stamps come late by `delay` s and `jitter` s (1 sigma), never early."""
 
     delay: float = 0.05
     jitter: float = 0.0

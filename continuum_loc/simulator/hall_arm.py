@@ -34,11 +34,7 @@ GROOVES = {
 
 
 class Imperfections(Settings):
-    """
-    What the true arm has and the robot description does not say.
-
-    All sigmas; zero makes a perfect arm.
-    """
+    """What the true arm has and its description does not say: sigmas, 0 if perfect."""
 
     mounting_deg: float = Field(
         0.5, ge=0.0, description='turn of every chip, about a random axis [deg]'
@@ -70,11 +66,7 @@ PERFECT = Imperfections(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posture:
-    """
-    Rotation of the base in map (3, 3), and twist and curvatures (N, 3) [1/m].
-
-    Those of the N arcs from base to tip.
-    """
+    """Rotation of the base in map (3, 3), and twist and curvatures (N, 3) [1/m] of the N arcs."""
 
     R_map_base: np.ndarray
     strain: np.ndarray
@@ -101,11 +93,7 @@ class Motion:
         return self.arrivals + np.asarray(self.hold)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        R_map_base (K, 3, 3) and strain (K, N, 3) at times (K,).
-
-        Acceleration is continuous throughout.
-        """
+        """R_map_base (K, 3, 3) and strain (K, N, 3) at times (K,), smooth in acceleration."""
         arrivals, departures = self.arrivals, self.departures
         knots = np.sort(np.concatenate([arrivals, departures]))
         index = np.clip(np.searchsorted(knots, times, side='right') - 1, 0, len(knots) - 2)
@@ -124,11 +112,7 @@ class Motion:
 
 
 def bent(robot: RobotDescription, curvature: float, azimuth: float = 0.0) -> np.ndarray:
-    """
-    (N, 3) strain of one arc.
-
-    The robot bends by `curvature` [1/m] from x towards y turned by `azimuth`.
-    """
+    """(N, 3) strain of a bend by `curvature` [1/m] from x towards y turned by `azimuth`."""
     return profile(robot, lambda s: (np.full_like(s, curvature), np.full_like(s, azimuth)))
 
 
@@ -158,11 +142,7 @@ def out_of_plane(robot: RobotDescription, curvature: float, turn: float = np.pi 
 def profile(
     robot: RobotDescription, bend: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """
-    (N, 3) strain of a twist-free shape.
-
-    `bend` gives curvature [1/m] and azimuth [rad] at arclengths (N,).
-    """
+    """(N, 3) strain without twist; `bend` gives curvature and azimuth at s (N,)."""
     ends = piece_ends(robot)
     curvature, azimuth = bend(ends - 0.5 * np.diff(ends, prepend=0.0))
     return np.column_stack(
@@ -171,11 +151,7 @@ def profile(
 
 
 def piece_ends(robot: RobotDescription) -> np.ndarray:
-    """
-    (N,) arclengths [m] of the ends of the arcs.
-
-    Every `PIECES`-th is a module's, the last is the tip's.
-    """
+    """(N,) arclengths [m] of the arcs' ends; each `PIECES`-th is a module, the last the tip."""
     marks = np.array(
         [0.0, *(robot.sensor_arclength(sensor.name) for sensor in robot.hall), robot.length]
     )

@@ -1,8 +1,4 @@
-"""
-Scenes from a mesh that a user brings.
-
-Checks that say what to change, and convex pieces for contact.
-"""
+"""Scenes from a mesh that a user brings: checked, and cut into convex pieces for contact."""
 
 from __future__ import annotations
 
@@ -10,8 +6,8 @@ from pathlib import Path
 
 from continuum_loc.errors import MapError, SceneError
 from continuum_loc.extras import require
-from continuum_loc.mapping.formats.shapes import Cloud
-from continuum_loc.mapping.map_files import read_shape
+from continuum_loc.formats.reading import read_shape
+from continuum_loc.formats.shapes import Cloud
 from continuum_loc.simulator.convex import convex_pieces
 from continuum_loc.simulator.scene import Scene
 from continuum_loc.simulator.scene_cache import cached_scene
@@ -28,9 +24,7 @@ _WALL = 0.05  # thickness given to a room that is modelled by its inner surface 
 
 def import_mesh(path: Path) -> Scene:
     """
-    Import a scene from an STL, OBJ or PLY file in metres and the map frame.
-
-    Raises SceneError.
+    Import a scene from an STL, OBJ or PLY file in metres and the map frame. Raises SceneError.
 
     The mesh is either a solid (faces counter-clockwise seen from outside), or the inner surface of
     a room (faces counter-clockwise seen from inside).
@@ -43,11 +37,7 @@ def import_mesh(path: Path) -> Scene:
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
-    """
-    Raise SceneError unless a mesh can be a scene.
-
-    It needs a credible size, no degenerate faces and no holes, and an orientation.
-    """
+    """Raise SceneError unless a mesh is closed, oriented, without bad faces, of a likely size."""
     if len(faces) == 0:
         raise SceneError(f'{where}: no faces; {_EXPORT}')
     if not np.all(np.isfinite(vertices)):

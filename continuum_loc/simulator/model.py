@@ -1,7 +1,5 @@
 """
-The robot as a MuJoCo model.
-
-A rod of rigid links on ball joints, tendons, an insertion drive, contacts.
+The robot as a MuJoCo model: rigid links on ball joints, tendons, an insertion drive, contacts.
 
 Nodes at s_0 = 0 ... s_N = L. Body i is rigid and centred on node i; it reaches half a segment to
 each side, and neighbours meet in a joint in the middle of their segment. So node i is the middle
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING
 from continuum_loc.errors import SettingsError, SimulationDiverged
 from continuum_loc.extras import require
 from continuum_loc.robot import Ring, RobotDescription
+from continuum_loc.simulator.carrier import Carrier, JOINTS, pose_of
 from continuum_loc.simulator.plant import node_arclengths, PlantSettings, Profile
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     import mujoco
 
 GRAVITY = 9.81
+SCALAR_LAST = np.array([1, 2, 3, 0])  # MuJoCo's w comes first, scipy's last
 ROBOT_BIT, SCENE_BIT = 1, 2  # collision masks: links meet the scene, never one another
 NODE_PREFIX = 'node'
 REST_SPEED = 1e-4
@@ -51,12 +51,13 @@ def build_spec(
     scene=None,
     profile: str = 'live',
     supported: bool = False,
+    carried: Carrier | None = None,
 ) -> mujoco.MjSpec:
     """
     Build the model before compilation.
 
-    `scene` gives the convex pieces to collide with, None the empty space; `supported` lets
-    something else carry the rod's weight.
+    scene: gives the convex pieces to collide with; None is empty space. supported: something else
+    carries the rod's weight. carried: what moves the base.
     """
     mujoco = require('mujoco', 'simulate')
 
@@ -73,12 +74,12 @@ def build_spec(
     if plant.GJ != plant.EI:
         spec.nuser_jnt = 1
     nodes = node_arclengths(robot, plant, chosen.link_length)
-    if robot.base.insertion.mode != 'fixed':
+    if robot.base.insertion.mode != 'fixed' or carried is not None:
         _check_step(plant, chosen.time_step)
-    _add_rod(spec, robot, plant, nodes)
+    _add_rod(spec, robot, plant, nodes, carried)
     _add_tendons(spec, plant, nodes)
     if scene is not None:
-        _add_scene(spec, robot, plant, scene)
+        _add_scene(spec, robot, plant, scene, carried)
     return spec
 
 
@@ -88,13 +89,10 @@ def build_model(
     scene=None,
     profile: str = 'live',
     supported: bool = False,
+    carried: Carrier | None = None,
 ) -> mujoco.MjModel:
-    """
-    Compile `build_spec`. Bodies `node0` ... `nodeN` are the rod's links, base to tip.
-
-    Raises SettingsError.
-    """
-    spec = build_spec(robot, plant, scene, profile, supported)
+    """Compile `build_spec`; bodies `node0` ... `nodeN` are the links. Raises SettingsError."""
+    spec = build_spec(robot, plant, scene, profile, supported, carried)
     try:
         return spec.compile()
     except ValueError as error:
@@ -132,8 +130,8 @@ def _add_twist_torque(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """
     excess = model.jnt_user[:, 0]
     joints = np.flatnonzero(excess)
-    quat = data.qpos[model.jnt_qposadr[joints, None] + np.arange(4)]
-    w = Rotation.from_quat(quat, scalar_first=True).as_rotvec()
+    quat = data.qpos[model.jnt_qposadr[joints, None] + SCALAR_LAST]
+    w = Rotation.from_quat(quat).as_rotvec()
     lever = np.stack([np.ones(len(joints)), -w[:, 2] / 2.0, w[:, 1] / 2.0], axis=1)
     torque = (excess[joints] * w[:, 0])[:, None] * lever
     data.qfrc_applied[model.jnt_dofadr[joints, None] + np.arange(3)] = torque
@@ -178,7 +176,7 @@ def uniform_rod(
     """
     Make a plain rod along x, clamped at the origin, for comparison with mechanics.
 
-    GJ: None is that of the ball joints alone, EI.
+    Without GJ it has that of the ball joints alone, EI.
 
     Its last body, `tip`, has no mass and lies at the rod's end: loads go there.
     """
@@ -201,11 +199,7 @@ def uniform_rod(
 
 
 def _check_step(plant: PlantSettings, time_step: float) -> None:
-    """
-    Check that the time step is stable: omega * step < 2 of the insertion drive.
-
-    It alone stays explicit; joint springs are implicit.
-    """
+    """Check omega * step < 2 of the insertion drive, which alone is stepped explicitly."""
     omega = np.sqrt(plant.carriage_stiffness / plant.carriage_mass)
     if omega * time_step > 1.0:
         raise SettingsError(
@@ -214,8 +208,14 @@ def _check_step(plant: PlantSettings, time_step: float) -> None:
         )
 
 
-def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndarray) -> None:
-    parent, joint_frame = _add_base(spec, robot, plant)
+def _add_rod(
+    spec,
+    robot: RobotDescription,
+    plant: PlantSettings,
+    nodes: np.ndarray,
+    carried: Carrier | None,
+) -> None:
+    parent, joint_frame = _add_base(spec, robot, plant, carried)
     # half[i], half[i + 1]: reach of node i back, forth.
     half = np.concatenate([[0.0], np.diff(nodes) / 2.0, [0.0]])
     for i in range(len(nodes)):
@@ -229,16 +229,15 @@ def _add_rod(spec, robot: RobotDescription, plant: PlantSettings, nodes: np.ndar
         )
 
 
-def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
-    """
-    Add the body that the rod's first node is fixed to.
-
-    On its insertion slide where the base can travel.
-    """
+def _add_base(spec, robot: RobotDescription, plant: PlantSettings, carried: Carrier | None = None):
+    """Add the body that the first node is fixed to, on the slide and drives that it has."""
     mujoco = require('mujoco', 'simulate')
 
-    quat = Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(scalar_first=True)
-    carriage = spec.worldbody.add_body(name='carriage', pos=robot.base.xyz, quat=quat)
+    quat = np.roll(Rotation.from_matrix(robot.base.T_map_base[:3, :3]).as_quat(), 1)
+    if carried is None:
+        carriage = spec.worldbody.add_body(name='carriage', pos=robot.base.xyz, quat=quat)
+    else:
+        carriage = _add_carrier(spec, robot, plant, quat).add_body(name='carriage')
     if robot.base.insertion.mode != 'fixed':
         carriage.add_joint(
             name='insertion',
@@ -251,6 +250,21 @@ def _add_base(spec, robot: RobotDescription, plant: PlantSettings):
         )
         drive.set_to_position(kp=plant.carriage_stiffness, kv=carriage_damping(plant))
     return carriage, (0.0, 0.0, 0.0)
+
+
+def _add_carrier(spec, robot: RobotDescription, plant: PlantSettings, quat: np.ndarray):
+    """Add the body of a carrier: three slides, then yaw, pitch and roll, each with its drive."""
+    mujoco = require('mujoco', 'simulate')
+
+    body = spec.worldbody.add_body(name='carrier', pos=robot.base.xyz, quat=quat)
+    body.mass, body.inertia, body.explicitinertial = 1e-6, (1e-9, 1e-9, 1e-9), True
+    kinds = [mujoco.mjtJoint.mjJNT_SLIDE] * 3 + [mujoco.mjtJoint.mjJNT_HINGE] * 3
+    axes = [*np.eye(3), *np.eye(3)[::-1]]
+    for name, kind, axis in zip(JOINTS, kinds, axes, strict=True):
+        body.add_joint(name=name, type=kind, axis=axis, armature=plant.carriage_mass)
+        drive = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+        drive.set_to_position(kp=plant.carriage_stiffness, kv=carriage_damping(plant))
+    return body
 
 
 def carriage_damping(plant: PlantSettings) -> float:
@@ -290,11 +304,7 @@ def _add_joints(body, i: int, plant: PlantSettings, segment: float) -> None:
 def _add_link(
     body, robot: RobotDescription, plant: PlantSettings, back: float, forth: float
 ) -> None:
-    """
-    Add a link from -back to +forth of the node.
-
-    The inertia of a solid cylinder, and the capsule that touches the scene.
-    """
+    """Add a link from -back to +forth of the node, a solid cylinder that touches as a capsule."""
     import mujoco
 
     length, centre = back + forth, (forth - back) / 2.0
@@ -323,9 +333,7 @@ def _add_link(
 
 def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
     """
-    Thread each tendon through a channel in every link up to its module's end.
-
-    Its actuator pulls with ctrl newtons.
+    Thread each tendon through every link up to its module's end; its actuator pulls ctrl newtons.
 
     A channel opens at GUIDE / 2 of a segment from each joint. Its straight stretch across the
     joint has the moment arm r cos(phi / 2) + GUIDE h / 2 sin(phi / 2): short stretches keep the
@@ -360,12 +368,14 @@ def _add_tendons(spec, plant: PlantSettings, nodes: np.ndarray) -> None:
             pull.gear = (-1.0, 0, 0, 0, 0, 0)
 
 
-def _add_scene(spec, robot: RobotDescription, plant: PlantSettings, scene) -> None:
+def _add_scene(
+    spec, robot: RobotDescription, plant: PlantSettings, scene, carried: Carrier | None = None
+) -> None:
     """Convex pieces that the robot can reach, as fixed geoms."""
     import mujoco
 
     for i, vertices in enumerate(scene.hulls):
-        if not _reachable(robot, vertices):
+        if not _reachable(robot, vertices, carried):
             continue
         spec.add_mesh(name=f'hull{i}', uservert=vertices.ravel())
         spec.worldbody.add_geom(
@@ -380,15 +390,17 @@ def _add_scene(spec, robot: RobotDescription, plant: PlantSettings, scene) -> No
         )
 
 
-def _reachable(robot: RobotDescription, vertices: np.ndarray) -> bool:
-    """
-    Whether a piece's bounding box meets the reach of the rod over its whole insertion.
-
-    The reach is shaped like a capsule.
-    """
+def _reachable(
+    robot: RobotDescription, vertices: np.ndarray, carried: Carrier | None = None
+) -> bool:
+    """Whether a piece's bounding box meets the capsule that the rod may reach."""
     T = robot.base.T_map_base
     travel = np.linspace(*robot.base.insertion.range, 8)
     origins = T[:3, 3] + travel[:, None] * T[:3, 0]
+    if carried is not None:
+        inserted = np.column_stack([travel, np.zeros((8, 2)), np.ones(8)])
+        poses = T @ pose_of(carried.values)
+        origins = (poses[:, None] @ inserted[..., None])[..., :3, 0].reshape(-1, 3)
     nearest = np.clip(origins, vertices.min(axis=0), vertices.max(axis=0))
     distance = np.linalg.norm(nearest - origins, axis=1).min()
     return bool(distance < robot.length + 2.0 * robot.radius)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from continuum_loc import lie
 import numpy as np
@@ -32,15 +33,47 @@ class State:
     tension: np.ndarray
 
 
+class _Curve(NamedTuple):
+    """
+    The curve in the local variable from one step to the next, of F frames.
+
+    xi: (F, 6) where the next step lies; v_a, w_b: (F, 6) its derivatives at both ends [1/s].
+    """
+
+    xi: np.ndarray
+    v_a: np.ndarray
+    w_b: np.ndarray
+
+    @classmethod
+    def through(cls, twist: np.ndarray, d: float) -> _Curve:
+        """Make the curve of the middle of three steps with twists (3, F, 6), of `d` seconds."""
+        v_a, v_b = (twist[0] + twist[1]) / 2.0, (twist[1] + twist[2]) / 2.0
+        xi = d * twist[1]
+        return cls(xi, v_a, np.einsum('fij,fj->fi', lie.right_jacobian_inverse(xi), v_b))
+
+    def at(self, u: float, d: float, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Local variable (F, 6) at the fraction u of the step."""
+        xi, v_a, w_b = (part[frames] for part in self)
+        return (
+            u**2 * (3.0 - 2.0 * u) * xi + u * (1.0 - u) ** 2 * d * v_a - u**2 * (1.0 - u) * d * w_b
+        )
+
+
 class Motion:
     """Four consecutive states; motion is defined between the middle two."""
 
     def __init__(self) -> None:
         self._states: deque[State] = deque(maxlen=4)
+        self._steps: deque[np.ndarray] = deque(maxlen=3)  # (N + 1, 6) from state to state
+        self._nodes: _Curve | None = None  # of all nodes in the middle step, once it is asked for
 
     def append(self, state: State) -> None:
         """Append the next state, one time step after the last."""
+        if self._states:
+            before = self._states[-1].T_map_node
+            self._steps.append(lie.log(lie.inverse(before) @ state.T_map_node))
         self._states.append(state)
+        self._nodes = None
 
     def covers(self, time: float) -> bool:
         """Whether `time` lies between the middle two states."""
@@ -60,38 +93,34 @@ class Motion:
 
     def pose(self, time: float, nodes: np.ndarray | slice = slice(None)) -> np.ndarray:
         """(F, 4, 4) poses T_map_node of the chosen nodes."""
-        if self._at(time)[0] == 0.0:
-            return self._states[1].T_map_node[nodes].copy()
-        return self.kinematics(time, self.frames(nodes, np.eye(4)))[0]
+        (u, d), start = self._at(time), self._states[1].T_map_node[nodes]
+        if u == 0.0:
+            return start.copy()
+        self._nodes = self._nodes or _Curve.through(np.stack(self._steps) / d, d)
+        return start @ lie.exp(self._nodes.at(u, d, nodes))
 
     def kinematics(
         self, time: float, frames: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Pose T_map_frame (F, 4, 4), body twist (F, 6) and acceleration of the origin (F, 3).
-
-        Twists are [v; w]; the acceleration is in map.
+        Pose (F, 4, 4) and acceleration (F, 3) in map, and body twist (F, 6) [v; w], of frames.
 
         `frames` are the four states of `frames()`. The acceleration is the second difference of
         position, linear between the steps.
         """
         u, d = self._at(time)
         twist = lie.log(lie.inverse(frames[:-1]) @ frames[1:]) / d
-        v_a, v_b = (twist[0] + twist[1]) / 2.0, (twist[1] + twist[2]) / 2.0
         position = frames[..., :3, 3]
         acceleration = np.diff(position, n=2, axis=0) / d**2
         acceleration = (1.0 - u) * acceleration[0] + u * acceleration[1]
         if u == 0.0:
-            return frames[1].copy(), v_a, acceleration
-        xi = d * twist[1]
-        w_b = np.einsum('fij,fj->fi', lie.right_jacobian_inverse(xi), v_b)
-        gamma = (
-            u**2 * (3.0 - 2.0 * u) * xi + u * (1.0 - u) ** 2 * d * v_a - u**2 * (1.0 - u) * d * w_b
-        )
+            return frames[1].copy(), (twist[0] + twist[1]) / 2.0, acceleration
+        curve = _Curve.through(twist, d)
+        gamma = curve.at(u, d)
         rate = (
             6.0 * u * (1.0 - u) * twist[1]
-            + (1.0 - u) * (1.0 - 3.0 * u) * v_a
-            + u * (3.0 * u - 2.0) * w_b
+            + (1.0 - u) * (1.0 - 3.0 * u) * curve.v_a
+            + u * (3.0 * u - 2.0) * curve.w_b
         )
         return (
             frames[1] @ lie.exp(gamma),
@@ -100,11 +129,7 @@ class Motion:
         )
 
     def encoders(self, time: float) -> tuple[float, np.ndarray, np.ndarray]:
-        """
-        Read insertion [m], tendon lengths (K,) [m] and tensions (K,) [N] at `time`.
-
-        They are linear between the steps.
-        """
+        """Read insertion [m], tendon lengths [m] and tensions [N] (K,), linear between steps."""
         u, _ = self._at(time)
         a, b = self._states[1], self._states[2]
         return tuple(
@@ -119,9 +144,7 @@ class Motion:
 
 def segment_strain(T_map_node: np.ndarray, nodes_s: np.ndarray) -> np.ndarray:
     """
-    (N, 6) strain [nu; omega] of each segment.
-
-    The screw that takes one node to the next, per unit of s.
+    (N, 6) strain [nu; omega] of each segment: the screw from node to node, per unit of s.
 
     For pure bending this is the constant-curvature arc that is tangent to both links at their
     middles.

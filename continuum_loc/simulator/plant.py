@@ -1,7 +1,5 @@
 """
-The true plant: what only the simulator knows of a robot.
-
-Stiffness, mass, friction, tendons, steps.
+The true plant, which only the simulator knows: stiffness, mass, friction, tendons, steps.
 
 The estimator never reads these files; see `continuum_loc.robot` for what both sides share.
 """
@@ -89,11 +87,7 @@ class PlantSettings(Settings):
         return self
 
     def profile(self, name: str) -> Profile:
-        """
-        Return the profile called `name`.
-
-        Raises SettingsError listing the valid names.
-        """
+        """Return the profile called `name`. Raises SettingsError listing the valid names."""
         if name not in self.profiles:
             raise SettingsError(f"no profile '{name}'; profiles: {', '.join(self.profiles)}")
         return self.profiles[name]
@@ -114,9 +108,7 @@ class PlantSettings(Settings):
 
     def tension_for_moments(self, moments: np.ndarray, pretension: float = 2.0) -> np.ndarray:
         """
-        Tensions (..., K) [N] whose moments add up to the bending moments wanted.
-
-        None is below `pretension`.
+        Tensions (..., K) [N], none below `pretension`, that bend the arm by the moments wanted.
 
         moments: (..., G, 2) total moment about body y and z [N m] inside each tendon set's own
         stretch, base to tip. A set also bends every stretch before its own, so it supplies the
@@ -152,9 +144,7 @@ class PlantSettings(Settings):
 
 def _tensions(group: TendonSet, moment: np.ndarray, pretension: float) -> np.ndarray:
     """
-    Least tensions of one set that give `moment` (..., 2).
-
-    What a lone tendon cannot give is left out.
+    Least tensions of one set that give `moment` (..., 2), as far as lone tendons can.
 
     A tension F at offset r gives the moment r x (-F x): per newton (-r_z, r_y) about (y, z).
     """
@@ -181,9 +171,7 @@ def node_arclengths(
     robot: RobotDescription, plant: PlantSettings, link_length: float
 ) -> np.ndarray:
     """
-    (N + 1,) arclengths of the rod's nodes.
-
-    Base, tip, every ring and module end, evenly cut between them.
+    (N + 1,) arclengths of the nodes: base, tip, rings and module ends, evenly cut between.
 
     A node at every ring makes the ring's pose a body's pose, with no interpolation between the
     two.

@@ -1,8 +1,4 @@
-"""
-Ray casting.
-
-The scene by Embree (through Open3D), the robot's own body as capsules by a compiled kernel.
-"""
+"""Ray casting: the scene by Embree (through Open3D), the robot's own body by a compiled kernel."""
 
 from __future__ import annotations
 
@@ -38,13 +34,31 @@ class RayCaster:
         Returns distance (N,) [m], inf where nothing is hit; face (N,) int64, -1 where nothing is
         hit; and the unit normal (N, 3) of the face, nan where nothing is hit.
         """
+        distance, faces = self._hits(origins, directions)
+        return (
+            distance,
+            faces,
+            np.where((faces < 0)[:, None], np.nan, self.scene.face_normals[faces]),
+        )
+
+    def cast_light(
+        self, origins: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Distance (N,) as by `cast`, and the share (N,) of light that comes back from there.
+
+        That is the reflectance times the cosine of incidence, 0 where nothing is hit.
+        """
+        distance, faces = self._hits(origins, directions)
+        scene = self.scene
+        return distance, _brightness(faces, directions, scene.face_normals, scene.reflectance)
+
+    def _hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
         hits = self._embree.cast_rays(self._tensor(rays))
         faces = hits['primitive_ids'].numpy()
-        missed = faces == self._invalid
-        faces = np.where(missed, -1, faces.astype(np.int64))
-        normals = np.where(missed[:, None], np.nan, self.scene.face_normals[faces])
-        return hits['t_hit'].numpy().astype(float), faces, normals
+        faces = np.where(faces == self._invalid, -1, faces.astype(np.int64))
+        return hits['t_hit'].numpy().astype(float), faces
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) from points (N, 3) to the nearest surface [m], negative inside solids."""
@@ -56,11 +70,18 @@ class RayCaster:
 
 
 @kernel
+def _brightness(faces, directions, normals, reflectance):
+    light = np.zeros(faces.shape[0])
+    for k in range(faces.shape[0]):
+        if faces[k] >= 0:
+            light[k] = reflectance[faces[k]] * abs(_dot(normals[faces[k]], directions[k]))
+    return light
+
+
+@kernel
 def cast_capsules(origins: np.ndarray, directions: np.ndarray, capsules: np.ndarray) -> np.ndarray:
     """
-    Distance (S, K) along the K unit rays of S fans to the first of M capsules.
-
-    inf where none is hit.
+    Distance (S, K) along the K unit rays of S fans to the first of M capsules; inf for none.
 
     origins: (S, 3). directions: (S, K, 3). Each capsule (M, 7) is ax ay az bx by bz radius: all
     points within `radius` of the segment from a to b. A fan that starts inside a capsule (its own
@@ -113,11 +134,7 @@ def _enclosing_cone(directions):
 
 @kernel
 def _outside_cone(cone_axis, half_angle, axis, offset, radius):
-    """
-    Tell where a capsule's bounding ball is clear of the fan's cone.
-
-    This sifts out nearly all of the body at once.
-    """
+    """Tell where a capsule's ball is clear of the fan's cone, as most of the body is."""
     to_centre = 0.5 * axis - offset
     reach = 0.5 * np.sqrt(_dot(axis, axis)) + radius
     distance = np.sqrt(_dot(to_centre, to_centre))

@@ -48,11 +48,7 @@ SIDES = 48
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """
-    A pinhole at `eye` looking at `target` (map, m), z up.
-
-    What lies before the plane y = `section` is cut away.
-    """
+    """A pinhole at `eye` that looks at `target` (map, m), z up; it sees from y = `section` on."""
 
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -140,11 +136,7 @@ def render(shapes: list[Shape], camera: Camera, daylight: int = 0) -> np.ndarray
 def robot_shapes(
     robot: RobotDescription, T_map_backbone: np.ndarray, T_map_ring: np.ndarray
 ) -> list[Shape]:
-    """
-    Draw the body along the backbone (B, 4, 4), and each sensor on its mount.
-
-    A dark band marks every ring (R, 4, 4).
-    """
+    """Draw the body along the backbone (B, 4, 4), rings (R, 4, 4) as dark bands, and sensors."""
     shapes = [_tube(T_map_backbone, robot.radius, BODY)]
     band = np.tile(np.eye(4), (2, 1, 1))
     band[:, 0, 3] = [-0.4 * robot.radius, 0.0]
@@ -156,11 +148,7 @@ def robot_shapes(
 
 
 def scene_shapes(scene: Scene) -> list[Shape]:
-    """
-    Draw the scene in its parts' colours.
-
-    In the engine, what was added to it and what is missing from it stand out.
-    """
+    """Draw the scene in its parts' colours; what was added or is missing stands out."""
     added = {anomaly.name for anomaly in scene.anomalies if anomaly.kind == 'added'} - set(PAINT)
     colours = [ADDED if name in added else PAINT.get(name, SCENE) for name in scene.objects]
     palette = sorted(set(colours))

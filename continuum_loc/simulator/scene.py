@@ -1,8 +1,4 @@
-"""
-What a scene is.
-
-A mesh for sensors, convex pieces for contact, and how it departs from its as-built version.
-"""
+"""What a scene is: a mesh for sensors, convex pieces for contact, its departures from as-built."""
 
 from __future__ import annotations
 
@@ -83,11 +79,7 @@ def scene_of_solid(
     parts: list[Part],
     anomalies: tuple[Anomaly, ...] = (),
 ) -> Scene:
-    """
-    Make the scene of united parts.
-
-    `owners` (F,) is the index of each face's part (see `solids.unite`).
-    """
+    """Make the scene of united parts; `owners` (F,) are the faces' parts (see `solids.unite`)."""
     vertices, faces = mesh_of(solid)
     reflectance = np.array([part.reflectance for part in parts])[owners]
     hulls = tuple(hull for part in parts for hull in part.hulls)

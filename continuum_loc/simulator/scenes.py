@@ -23,9 +23,7 @@ MESH_SUFFIXES = ('.stl', '.obj', '.ply')
 
 def load_scene(name_or_path: str | Path) -> Scene:
     """
-    Load a scene by name or from a mesh file.
-
-    Names: `S0`-`S9`, `H1`-`H3`, `R0`-`R4`. Files: STL, OBJ, PLY; metres, map frame.
+    Load a scene by name (`S0`-`S9`, `H1`-`H3`, `R0`-`R4`) or from a mesh file in metres.
 
     Raises SceneError for an unknown name, an unreadable file, or a mesh that is not fit for use.
     """

@@ -1,7 +1,5 @@
 """
-Sensor models other than ToF.
-
-True motion in, samples with noise, bias, quantisation and saturation out.
+Sensors other than ToF: true motion in; samples with noise, bias, steps and full scale out.
 
 Each model owns one random stream, so that one sensor's noise does not depend on which others are
 simulated.
@@ -165,11 +163,7 @@ class Trackers:
 
 
 class Encoders:
-    """
-    Tendon displacement (0 when straight) and force, and base insertion.
-
-    No insertion where its sigma is None; position is noisy.
-    """
+    """Tendon displacement (0 when straight) and force, and insertion unless its sigma is None."""
 
     def __init__(
         self,

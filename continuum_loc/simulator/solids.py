@@ -1,7 +1,5 @@
 """
-Solids for procedurally made scenes.
-
-Parts, their union into one watertight mesh, and how to place them.
+Solids for procedural scenes: parts, their watertight union, and how to place them.
 
 Map frame throughout; metres. `azimuth` turns about the map's x axis, from +z (0 deg) towards +y.
 """
@@ -51,11 +49,7 @@ def unite(parts: list[Part]) -> tuple[Manifold, np.ndarray]:
 
 
 def mesh_of(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Vertices (V, 3) float64 and faces (F, 3) int32 of a solid.
-
-    Faces are in the order of `Manifold.to_mesh64`.
-    """
+    """Vertices (V, 3) float64 and faces (F, 3) int32 of a solid, in the order of Manifold."""
     mesh = solid.to_mesh64()
     return np.ascontiguousarray(mesh.vert_properties[:, :3]), mesh.tri_verts.astype(np.int32)
 
@@ -66,11 +60,7 @@ def vertices_of(solid: Manifold) -> np.ndarray:
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
-    """
-    Make the solid inside a closed mesh.
-
-    Raises ValueError where the mesh is not a closed, oriented surface.
-    """
+    """Make the solid inside a mesh. Raises ValueError where that is not closed and oriented."""
     # Copies: the binding takes no read-only arrays.
     solid = Manifold(
         Mesh64(np.array(vertices, dtype=np.float64, order='C'), faces.astype(np.uint64))

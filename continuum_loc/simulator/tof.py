@@ -86,11 +86,10 @@ class TofSensorModel:
     def _cast(self, T_map_sensors: np.ndarray, body_capsules: np.ndarray | None) -> Echoes:
         rays = self._receiver.directions @ T_map_sensors[:, :3, :3].transpose(0, 2, 1)
         origins = np.ascontiguousarray(T_map_sensors[:, :3, 3])
-        flat = rays.reshape(-1, 3)
-        distance, face, normal = self._caster.cast(np.repeat(origins, rays.shape[1], axis=0), flat)
-        cosine = np.abs(np.einsum('ij,ij->i', normal, flat))
-        brightness = np.where(face >= 0, self._caster.scene.reflectance[face] * cosine, 0.0)
-        distance, brightness = distance.reshape(rays.shape[:2]), brightness.reshape(rays.shape[:2])
+        light = self._caster.cast_light(
+            np.repeat(origins, rays.shape[1], axis=0), rays.reshape(-1, 3)
+        )
+        distance, brightness = (part.reshape(rays.shape[:2]) for part in light)
         if body_capsules is None:
             return Echoes(distance, brightness)
         body = cast_capsules(

@@ -10,6 +10,7 @@ show.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from scipy.interpolate import PchipInterpolator
 
 REST = 1.0  # seconds at rest at the start
 GRAVITY = 9.81
+LEVELLED = 0.25  # [s] between keyframes of a trajectory that follows a rolled base
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +39,7 @@ class Command:
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
     """
-    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m.
-
-    They are held before the first and after the last.
+    Keyframes: times (M,) s, tensions (M, K) N, insertion (M,) m; the first and last are held.
 
     supported: the arm lies in a groove that carries its weight.
     """
@@ -146,11 +146,7 @@ class Keyframe(Settings):
 
 
 class TrajectoryFile(Settings):
-    """
-    A trajectory of your own, as YAML.
-
-    `keyframes`, and whether the arm is `supported` against gravity.
-    """
+    """A trajectory of your own, as YAML: `keyframes`, and whether the arm is `supported`."""
 
     keyframes: tuple[Keyframe, ...] = Field(min_length=2)
     supported: bool = False
@@ -229,11 +225,33 @@ def _engine(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
     )
 
 
+def levelled(
+    name: str, robot: RobotDescription, plant: PlantSettings, roll: Callable[[float], float]
+) -> Drive:
+    """
+    Make a trajectory of the engine robot whose base is rolled by `roll` (time [s]) [rad].
+
+    The moments stay as they are in `map`: a robot that is held level must not sag aside because
+    its base is turned about it.
+    """
+    if name not in _ENGINE or len(plant.tendons) != len(_ENGINE[name][0]) - 2:
+        raise SettingsError(f"no trajectory '{name}' of robot '{robot.name}' for a rolled base")
+    rows = _ENGINE[name]
+    keys = np.array([row[0] for row in rows])
+    curvature = PchipInterpolator(keys, np.array([row[2:] for row in rows]))
+    times = np.arange(keys[0], keys[-1] + 1e-9, LEVELLED)
+    moments = plant.EI * curvature(times) + _level_moments(robot, plant)
+    angle = np.array([roll(time) for time in times])
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    y, z = moments[..., 0], moments[..., 1]
+    turned = np.stack([cos * y + sin * z, cos * z - sin * y], axis=-1)
+    insertion = PchipInterpolator(keys, np.array([row[1] for row in rows]))(times)
+    return Drive(name, times, plant.tension_for_moments(turned), insertion)
+
+
 def _level_moments(robot: RobotDescription, plant: PlantSettings) -> np.ndarray:
     """
-    (G, 2) bending moments whose mean holds a level rod against its own weight.
-
-    They are constant in each module.
+    (G, 2) bending moments, one for each module, whose mean holds a level rod against its weight.
 
     A cantilever's moment is w (L - s)^2 / 2; the mean over [a, b] is w ((L - a)^3 - (L - b)^3) /
     (6 (b - a)).
@@ -424,11 +442,7 @@ def _free(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
 
 
 def _groove(name: str, robot: RobotDescription, plant: PlantSettings) -> Drive:
-    """
-    From straight into the groove within three seconds, then still.
-
-    Uniform moment bends a uniform rod to an arc.
-    """
+    """From straight into the groove within three seconds by a uniform moment, then still."""
     curvature = _GROOVES[name] * np.array([0.0, 1.0, 1.0])
     moments = plant.EI * np.stack([curvature, np.zeros(3)], axis=-1)[:, None, :]
     times = np.array([REST, REST + 3.0, REST + 9.0])

@@ -1,7 +1,5 @@
 """
-What a VL53L5CX makes of the light that comes back.
-
-One perpendicular distance and a status for each zone.
+What a VL53L5CX makes of the light that comes back: a distance and a status for each zone.
 
 A zone sees 4x4 sub-rays over its solid angle. Their light lies on a histogram of depth (distance
 along the optical axis); pulses nearer than the pulse's width merge, which puts mixed readings
@@ -31,18 +29,13 @@ import numpy as np
 # leaves no target.
 STATUS_STRAY, STATUS_FAINT, STATUS_WIDE_PULSE, STATUS_NEW_TARGET = 2, 4, 9, 10
 STATUS_INCONSISTENT = 13
-_MEASURED = (TOF_VALID, STATUS_WIDE_PULSE)
 
 _MILLIMETRE = 1e-3
 _FORGETS = 0.05  # share of the way to 1 m that a distance in the registers goes each frame
 
 
 class Vl53l5cxReceiver:
-    """
-    Turns sub-ray echoes into readings.
-
-    It keeps what each unit has of its own and remembers (`vl53l5cx_unit.Units`).
-    """
+    """Turns sub-ray echoes into readings; `vl53l5cx_unit.Units` are what it remembers."""
 
     def __init__(self, tof_model: TofModel, settings: Vl53l5cxSettings | None = None) -> None:
         self._model, self._settings = tof_model, settings or Vl53l5cxSettings()
@@ -72,12 +65,9 @@ class Vl53l5cxReceiver:
         )
         raw = _registered(raw, status, units, uniform[5])
         self._remember(names, units, status, raw)
-        measured = np.isin(status, _MEASURED)
-        ranges = np.select(
-            [status == TOF_NO_TARGET, measured & (raw < self._model.min_range), measured],
-            [np.inf, -np.inf, raw / self._zone_cosine],
-            np.nan,
-        )
+        ranges = np.where(_measured(status), raw / self._zone_cosine, np.nan)
+        ranges[_measured(status) & (raw < self._model.min_range)] = -np.inf
+        ranges[status == TOF_NO_TARGET] = np.inf
         stated = np.maximum(np.round(sigma / _MILLIMETRE), 1.0) * _MILLIMETRE / self._zone_cosine
         return Readings(ranges, np.where(np.isfinite(ranges), stated, np.nan), status, raw)
 
@@ -90,7 +80,7 @@ class Vl53l5cxReceiver:
     def _remember(
         self, names: Sequence[str], units: Units, status: np.ndarray, raw: np.ndarray
     ) -> None:
-        units.seen = np.isin(status, (*_MEASURED, STATUS_NEW_TARGET))
+        units.seen = _measured(status) | (status == STATUS_NEW_TARGET)
         units.stray = status == STATUS_STRAY
         units.register = np.where(units.seen, raw, units.register)
         units.forget(_FORGETS)
@@ -98,11 +88,7 @@ class Vl53l5cxReceiver:
         self._units.update(zip(names, units.apart(), strict=True))
 
     def _own_targets(self, echoes: Echoes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """
-        Depth, signal and spread (S, Z) of each zone's target, before crosstalk.
-
-        Signal is 0 where there is none.
-        """
+        """Depth, signal (0: none) and spread (S, Z) of each zone's target, before crosstalk."""
         zones, sub_rays = self._sub_directions.shape[:2]
         distance = echoes.distance.reshape(-1, sub_rays)
         seen = np.isfinite(distance)
@@ -157,7 +143,7 @@ class Vl53l5cxReceiver:
         uniform: np.ndarray,
         units: Units,
     ) -> np.ndarray:
-        """Target status (S, Z), the gravest first; uniform (6, S, Z) decides what is chance."""
+        """Target status (S, Z), the gravest last; uniform (6, S, Z) decides what is chance."""
         settings = self._settings
         none = (
             (signal < settings.lit_threshold)
@@ -166,23 +152,22 @@ class Vl53l5cxReceiver:
             | ((depth < settings.near) & units.blind)
         )
         goes_on = np.where(units.stray, settings.stray_stays, settings.stray)
-        conditions = [
-            none & (uniform[2] < goes_on),
-            none & (uniform[3] < settings.faint),
-            none,
-            uniform[3] < settings.inconsistent,
-            ~units.seen & (uniform[4] < settings.new_target),
-            spread > settings.wide_pulse,
-        ]
-        statuses = [
-            STATUS_STRAY,
-            STATUS_FAINT,
-            TOF_NO_TARGET,
-            STATUS_INCONSISTENT,
-            STATUS_NEW_TARGET,
-            STATUS_WIDE_PULSE,
-        ]
-        return np.select(conditions, statuses, TOF_VALID).astype(np.uint8)
+        status = np.full(depth.shape, TOF_VALID, np.uint8)
+        for code, condition in (
+            (STATUS_WIDE_PULSE, spread > settings.wide_pulse),
+            (STATUS_NEW_TARGET, ~units.seen & (uniform[4] < settings.new_target)),
+            (STATUS_INCONSISTENT, uniform[3] < settings.inconsistent),
+            (TOF_NO_TARGET, none),
+            (STATUS_FAINT, none & (uniform[3] < settings.faint)),
+            (STATUS_STRAY, none & (uniform[2] < goes_on)),
+        ):
+            status[condition] = code
+        return status
+
+
+def _measured(status: np.ndarray) -> np.ndarray:
+    """Whether a status comes with a distance that means something."""
+    return (status == TOF_VALID) | (status == STATUS_WIDE_PULSE)
 
 
 def _whole(depth: np.ndarray) -> np.ndarray:
@@ -200,7 +185,7 @@ def _registered(
     """
     far = _whole(3.5 + 0.8 * uniform)
     stray, faint = np.where(uniform < 0.24, 0.0, far), np.where(uniform < 0.3, far, units.register)
-    return np.select([status == STATUS_STRAY, status == STATUS_FAINT], [stray, faint], raw)
+    return np.where(status == STATUS_STRAY, stray, np.where(status == STATUS_FAINT, faint, raw))
 
 
 def _sub_directions(model: TofModel, sub_rays: int) -> np.ndarray:
@@ -215,24 +200,25 @@ def _sub_directions(model: TofModel, sub_rays: int) -> np.ndarray:
     )
 
 
-def _brightest_neighbour(signal: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@kernel
+def _brightest_neighbour(signal, depth):
     """
     Signal and depth (S, rows, columns) of the brightest neighbour of each zone.
 
-    There are up to eight round it.
+    There are up to eight round it; beyond the grid there is no light.
     """
-    rows, columns = signal.shape[1:]
-    signals = np.zeros((len(signal), rows + 2, columns + 2))
-    depths = signals.copy()
-    signals[:, 1:-1, 1:-1], depths[:, 1:-1, 1:-1] = signal, depth
+    sensors, rows, columns = signal.shape
     best_signal, best_depth = np.full(signal.shape, -1.0), np.zeros(signal.shape)
-    for row in range(3):
-        for column in range(3):
-            if (row, column) != (1, 1):
-                there = np.s_[:, slice(row, row + rows), slice(column, column + columns)]
-                brighter = signals[there] > best_signal
-                best_signal = np.where(brighter, signals[there], best_signal)
-                best_depth = np.where(brighter, depths[there], best_depth)
+    for s in range(sensors):
+        for i in range(rows):
+            for j in range(columns):
+                for neighbour in range(9):
+                    row, column = i + neighbour // 3 - 1, j + neighbour % 3 - 1
+                    light, distance = 0.0, 0.0
+                    if 0 <= row < rows and 0 <= column < columns:
+                        light, distance = signal[s, row, column], depth[s, row, column]
+                    if neighbour != 4 and light > best_signal[s, i, j]:
+                        best_signal[s, i, j], best_depth[s, i, j] = light, distance
     return best_signal, best_depth
 
 

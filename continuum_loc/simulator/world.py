@@ -1,7 +1,5 @@
 """
-The simulated world.
-
-A robot in a scene, driven along a trajectory, and every sensor's samples with the truth.
+The simulated world: a robot driven through a scene, its samples, and the truth.
 
     world = World(load_robot("engine"), load_scene("S0"), "t1")
     for sample in world.run(20.0):
@@ -23,6 +21,7 @@ from continuum_loc.errors import SettingsError
 from continuum_loc.measurements import Measurement, NANOSECONDS, TruthSample
 from continuum_loc.robot import RobotDescription, Sensor
 from continuum_loc.simulator import sensors as models
+from continuum_loc.simulator.carrier import BaseTeller, Carrier, carrier, JOINTS
 from continuum_loc.simulator.model import (
     advance,
     build_model,
@@ -39,7 +38,7 @@ from continuum_loc.simulator.plant import (
     PlantSettings,
 )
 from continuum_loc.simulator.readout import ReadoutSettings
-from continuum_loc.simulator.trajectories import Drive, trajectory
+from continuum_loc.simulator.trajectories import Drive, levelled, trajectory
 import numpy as np
 
 if TYPE_CHECKING:
@@ -80,6 +79,7 @@ class World:
     their frames come; None takes what public flights show.
     T_magnet_true: (4, 4), where the magnet sits in the frame where it should; None: there.
     faults: wrappers of `faults`, applied to the stream in order.
+    carried: what carries the base, a name of `carrier.carrier` or a Carrier; None: it stands.
     """
 
     def __init__(
@@ -97,6 +97,7 @@ class World:
         seed: int = 0,
         faults: tuple = (),
         start_stamp: int = DEFAULT_START,
+        carried: Carrier | str | None = None,
     ) -> None:
         self.robot, self.scene, self.seed, self.faults, self.start_stamp = (
             robot,
@@ -106,13 +107,17 @@ class World:
             start_stamp,
         )
         self.plant = plant if isinstance(plant, PlantSettings) else _plant(plant, robot)
+        self.carried = carrier(carried, robot) if isinstance(carried, str) else carried
+        if self.carried is not None and robot.name == 'engine' and isinstance(trajectory, str):
+            trajectory = levelled(trajectory, robot, self.plant, self.carried.roll)
         self.trajectory = _resolve(trajectory, robot, self.plant)
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
         _check_fidelity(tof_fidelity)
         self.tof_fidelity, self.tof_settings = tof_fidelity, tof_settings
         self.readout, self.T_magnet_true = readout or ReadoutSettings(), T_magnet_true
-        model = build_model(robot, self.plant, scene, profile, self.trajectory.supported)
-        self.body = _Body(robot, self.plant, model, self.trajectory)
+        supported = self.trajectory.supported
+        model = build_model(robot, self.plant, scene, profile, supported, self.carried)
+        self.body = _Body(robot, self.plant, model, self.trajectory, self.carried)
         self.motion = Motion()
         if scene is not None:
             from continuum_loc.simulator.placement import check_start
@@ -121,9 +126,7 @@ class World:
 
     def run(self, duration: float | None = None) -> Iterator[Measurement | TruthSample]:
         """
-        Yield samples of the first `duration` seconds, in the order of their stamps.
-
-        The default is the trajectory's duration.
+        Yield the samples of `duration` seconds (None: the trajectory's), by their stamps.
 
         Every call starts again from rest. Raises SettingsError for a duration that is none, and
         model.SimulationDiverged.
@@ -167,6 +170,9 @@ class World:
             if present:
                 streams.append(make(rng))
         rng = next(generators)
+        if self.carried is not None and robot.base.mode == 'measured':
+            # Its stream is drawn last, so that all others are as those of a base that stands.
+            streams.append(self._base_stream(np.random.default_rng((self.seed, 1))))
         if robot.tof and self.scene and self.tof_fidelity == 'paper':
             streams.append(self._tof_stream(rng))
         elif robot.tof and self.scene:
@@ -176,6 +182,18 @@ class World:
     def _truth(self, stamp: int, time: float) -> list[TruthSample]:
         rings = np.searchsorted(self.nodes_s, self.robot.ring_arclengths - 1e-6)
         return [TruthSample(stamp, self.motion.pose(time, np.concatenate([[0], rings])))]
+
+    def _base_stream(self, rng: np.random.Generator) -> _Stream:
+        told = self.robot.base.measurement
+        model = BaseTeller(self.carried.told, told.frame, told.rate, rng)
+
+        def sample(stamp: int, time: float) -> list:
+            T_map_base = self.motion.pose(time, np.array([0]))[0]
+            travel, _, _ = self.motion.encoders(time)
+            T_map_base[:3, 3] -= travel * T_map_base[:3, 0]
+            return model.measure(stamp, time, T_map_base)
+
+        return _Stream(told.rate, sample)
 
     def _encoder_stream(self, rng: np.random.Generator) -> _Stream:
         moves = self.robot.base.insertion.mode == 'measured'
@@ -301,7 +319,12 @@ class _Body:
     """MuJoCo's side: drives in, states out."""
 
     def __init__(
-        self, robot: RobotDescription, plant: PlantSettings, model: Any, path: Drive
+        self,
+        robot: RobotDescription,
+        plant: PlantSettings,
+        model: Any,
+        path: Drive,
+        carried: Carrier | None = None,
     ) -> None:
         import mujoco
 
@@ -310,6 +333,8 @@ class _Body:
             [i for i in range(model.nbody) if model.body(i).name.startswith(NODE_PREFIX)]
         )
         self._slides = robot.base.insertion.mode != 'fixed'
+        self._carried = carried
+        self._driven = self._slides + (len(JOINTS) if carried else 0)  # joints of base and carrier
         # [s], cancels the drag of the drive's damping.
         self._lead = carriage_damping(plant) / plant.carriage_stiffness
         mujoco.mj_forward(model, self.data)
@@ -329,15 +354,10 @@ class _Body:
     def _start_straight(self) -> None:
         self._mujoco.mj_resetData(self.model, self.data)
         self._command(0.0)
-        if self._slides:
-            self.data.qpos[0] = self.data.ctrl[0]
+        self.data.qpos[: self._driven] = self.data.ctrl[: self._driven]
 
     def settle(self) -> None:
-        """
-        Bring the robot to rest under the first command, from straight.
-
-        Time 0 is then the trajectory's start.
-        """
+        """Bring the robot from straight to rest under the trajectory's first command."""
         self._start_straight()
         settle(self.model, self.data)
         self.data.time = 0.0
@@ -357,9 +377,7 @@ class _Body:
 
     def step(self) -> State:
         """
-        Return the state at the next step's beginning; then take the step.
-
-        Before it is taken, the drives' new command acts.
+        Return the state at the next step's beginning; then set the drives and take the step.
 
         MuJoCo's derived quantities after a step still belong to its beginning, so no extra
         kinematics are needed.
@@ -377,6 +395,9 @@ class _Body:
     def _command(self, time: float) -> None:
         command = self.path.command(time)
         drive = [command.insertion + self._lead * command.insertion_rate] if self._slides else []
+        if self._carried is not None:
+            value, rate = self._carried.command(time)
+            drive = [*(value + self._lead * rate), *drive]
         self.data.ctrl[:] = np.append(drive, command.tension)
 
     def _state(self, time: float) -> State:
@@ -385,11 +406,16 @@ class _Body:
         T[:, :3, :3] = data.xmat[self._nodes].reshape(-1, 3, 3)
         T[:, :3, 3] = data.xpos[self._nodes]
         T[:, 3, 3] = 1.0
-        tendons = data.ctrl[1:] if self._slides else data.ctrl
+        driven = self._driven
+        tendons = data.ctrl[driven:]
         return State(time, T, self._insertion(T), data.ten_length.copy(), tendons.copy())
 
     def _insertion(self, T_map_node: np.ndarray) -> float:
         """Travel of the base along its own axis [m], from the same kinematics as the poses."""
+        if self._carried is not None:
+            mount = self.data.body('carrier')
+            axis = mount.xmat.reshape(3, 3)[:, 0]
+            return float((T_map_node[0, :3, 3] - mount.xpos) @ axis)
         base = self.model.body('carriage')
         R = np.zeros(9)
         self._mujoco.mju_quat2Mat(R, base.quat)

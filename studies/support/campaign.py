@@ -36,6 +36,7 @@ from continuum_loc.offline.trials import Trial
 if TYPE_CHECKING:
     from continuum_loc.estimator.settings import EstimatorSettings
 
+ONLY_ESTIMATED = ('map_scene', 'base')  # what a trial's recording does not depend on
 MADE_BY = 'made_by.txt'  # in a recording's folder: the digest of what it was simulated from
 
 
@@ -120,7 +121,7 @@ def recorded(bag: Path, trial: Trial) -> bool:
 
 def made_from(trial: Trial) -> str:
     """Digest all that decides a trial's recording: what it says, files it names, and code."""
-    said = {name: value for name, value in asdict(trial).items() if name != 'map_scene'}
+    said = {name: value for name, value in asdict(trial).items() if name not in ONLY_ESTIMATED}
     files = {
         name: content_digest(Path(value))
         for name, value in said.items()
@@ -181,7 +182,6 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
     from continuum_loc.offline.replay import replay
     from continuum_loc.offline.runs import save_run
     from continuum_loc.offline.trial_runs import configuration, trial_map_file
-    from continuum_loc.robot import load_robot
 
     settings = settings or trial_settings(trial)
     map_file = trial_map_file(trial)
@@ -195,7 +195,7 @@ def _run(folder: Path, bag: Path, trial: Trial, settings: EstimatorSettings | No
         if summary.get('configuration_digest') == key:
             return Outcome(trial, _complete(summary, folder))
     (folder / 'error.txt').unlink(missing_ok=True)
-    estimator = make_filter(load_robot(trial.robot), load_map(map_file), settings)
+    estimator = make_filter(trial.description, load_map(map_file), settings)
     result = replay(bag, estimator)
     return Outcome(
         trial,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from continuum_loc.estimator.factors.base import ClockScores, Factor, FactorReport, Guess, Setup
+from continuum_loc.estimator.factors.base_pose import BasePoseFactor
 from continuum_loc.estimator.factors.field import FieldFactor
 from continuum_loc.estimator.factors.gravity import GravityFactor
 from continuum_loc.estimator.factors.gyro import GyroFactor
@@ -15,6 +16,7 @@ FACTORS: tuple[type[Factor], ...] = (
     StrainFactor,
     TrackerFactor,
     InsertionFactor,
+    BasePoseFactor,
     GravityFactor,
     FieldFactor,
     TofFactor,

@@ -29,7 +29,7 @@ from continuum_loc.robot import RobotDescription
 import numpy as np
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Setup:
     """What factors are made from; the map's lookup and surface are made once, when asked for."""
 
@@ -82,10 +82,11 @@ class ClockScores(NamedTuple):
 
 @dataclass(slots=True)
 class Guess:
-    """Base (4, 4) and strain (N, 6) from which the first solve starts."""
+    """Base (4, 4), strain (N, 6) and frames (F, 4, 4) from which the first solve starts."""
 
     T_map_base: np.ndarray
     strain: np.ndarray
+    T_map_frame: np.ndarray
 
 
 class Factor(ABC):
@@ -97,7 +98,7 @@ class Factor(ABC):
     """
 
     name: ClassVar[str]
-    consumes: ClassVar[type]
+    consumes: type | tuple[type, ...]
     batch: ClassVar[type]  # named tuple of times and of what a row has, with a number in front
     rate: float = 0.0  # [Hz] of its sensors, where these set the pace of the estimates
     tight: bool = True  # whether it matches as narrowly as while tracking
@@ -111,6 +112,10 @@ class Factor(ABC):
     def wanted(cls, setup: Setup) -> bool:
         """Whether a filter of this setup has such a factor: unless its settings switch it off."""
         return getattr(getattr(setup.settings, cls.name, None), 'enabled', True)
+
+    def describe(self, robot: RobotDescription) -> None:
+        """Read measurements as those of a robot with other constants (`parameters`)."""
+        self.robot = robot
 
     @abstractmethod
     def row(self, measurement: Any) -> tuple:
@@ -138,6 +143,14 @@ class Factor(ABC):
     def awaited(self) -> bool:
         """Whether the first guess of the body is a poor one without this kind of sample."""
         return False
+
+    def needed(self) -> type | None:
+        """Say which kind of sample the filter cannot begin without."""
+        return None
+
+    def lateness(self, measurement: Any) -> float:
+        """By how much a measurement's stamp is later than what it tells of [s]."""
+        return 0.0
 
     def guess(self, row: tuple, guess: Guess) -> None:  # noqa: B027
         """Put what a row tells of base and shape into the first guess."""

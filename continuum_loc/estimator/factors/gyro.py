@@ -100,7 +100,9 @@ class GyroFactor(Factor):
         return FactorReport(cost, squared, residuals.size, fits, rattle)
 
     def bordered(self, batch, a, b, border, of):
-        columns = np.hstack([of.columns(kind, self.sensors) for kind in ('gyro', 'clock')])
+        columns = np.hstack(
+            [of.columns(kind, self.sensors) for kind in ('gyro', 'clock', 'delay')]
+        )
         noise = Noise(self.information, self.weights, self.settings.gyro.cauchy)
         _add_border(border, a, b, batch, noise, columns, self._work)
 
@@ -157,7 +159,7 @@ def _add(normal, a, b, batch, noise, residuals, work):
         robust = 1.0 / (1.0 + spread / c2)
         cost += 0.5 * noise.shares[imu] * 3.0 * samples * c2 * np.log1p(spread / c2)
         squared += misfit * robust
-        _rows_with_bias(a, n, imu, index)
+        _rows_with_bias(a, n, imu, normal.g.shape[0] // 2, index)
         scatter(normal, index, total, noise.shares[imu] * noise.weight * robust)
         misfit, samples = 0.0, 0
     return cost, squared
@@ -189,8 +191,8 @@ def _add_border(border, a, b, batch, noise, columns, work):
 def _add_sample(border, a, b, batch, m, information, columns, work):
     """Add one sample, whose node `relate` left in the workspace."""
     n, imu, time = batch.nodes[m], batch.imus[m], batch.times[m]
-    slope, index, J, D = np.empty(3), np.empty(27, np.int64), np.zeros(27), np.zeros(10)
-    _rows_with_bias(a, n, imu, index)
+    slope, index, J, D = np.empty(3), np.empty(27, np.int64), np.zeros(27), np.zeros(11)
+    _rows_with_bias(a, n, imu, border.C.shape[0] // 2, index)
     _acceleration(work, time, b.time - a.time, slope)
     gp.evaluate(work, time, False, 3)
     at = work[0]
@@ -203,13 +205,13 @@ def _add_sample(border, a, b, batch, m, information, columns, work):
         D[:] = 0.0
         for j in range(3):
             D[3 * i + j] = -batch.omega[m, j]
-        D[9] = slope[i]
-        for p in range(10):
+        D[9] = D[10] = slope[i]
+        for p in range(11):
             if columns[p] < 0 or D[p] == 0.0:
                 continue
             weighted = information * D[p]
             border.g[columns[p]] += weighted * error
-            for q in range(10):
+            for q in range(11):
                 if columns[q] >= 0:
                     border.H[columns[p], columns[q]] += weighted * D[q]
             for j in range(27):
@@ -217,10 +219,10 @@ def _add_sample(border, a, b, batch, m, information, columns, work):
 
 
 @kernel
-def _rows_with_bias(column, n, imu, index):
-    """Rows (27,) of a node at two knots, with the older knot's bias between them."""
+def _rows_with_bias(column, n, imu, dim, index):
+    """Rows (27,) of a node at two knots of `dim` each, with the older knot's bias between them."""
     biases = NODE_DIM * column.T.shape[0]
-    rows_in_time(n, biases + 3 * column.bias.shape[0], index)
+    rows_in_time(n, dim, index)
     index[15:] = index[12:24].copy()
     for i in range(3):
         index[12 + i] = biases + 3 * imu + i

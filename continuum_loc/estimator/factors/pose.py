@@ -18,6 +18,7 @@ from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.readings import travel_cause
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.measurements import EncoderSample, TrackedPose
+from continuum_loc.robot import Insertion
 import numpy as np
 
 FIT_SQUARED = 27.9  # chi-squared of six degrees of freedom at 1e-4
@@ -42,16 +43,22 @@ class Batch(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """Scale of the robust loss, what each of S sensors counts by, and its [usable, fitting]."""
+    """
+    Scale of the robust loss, what each of S sensors counts by, and its [usable, fitting].
+
+    plain: squared error up to which the loss is a square.
+    """
 
     cauchy: float
+    plain: float
     weights: np.ndarray
     fits: np.ndarray
 
 
 class _PoseFactor(Factor):
     batch = Batch
-    cauchy = np.inf
+    cauchy: float
+    plain = 0.0
 
     def stack(self, times, rows):
         order = np.argsort([row.node for row in rows], kind='stable')  # node by node
@@ -59,22 +66,18 @@ class _PoseFactor(Factor):
 
     def linearise(self, batch, a, b, normal):
         fits = np.zeros((len(self.sensors), 2))
-        loss = Loss(self.cauchy, self.weights, fits)
+        loss = Loss(self.cauchy, self.plain, self.weights, fits)
         cost, squared = _add(normal, a, b, batch, loss, self._work)
         observed = np.diagonal(batch.information, axis1=1, axis2=2) > 0.0
-        told = fits if self.robust else None
-        return FactorReport(cost, squared, int(np.sum(observed)), told)
-
-    @property
-    def robust(self) -> bool:
-        return bool(np.isfinite(self.cauchy))
+        return FactorReport(cost, squared, int(np.sum(observed)), fits)
 
     def bordered(self, batch, a, b, border, of):
         found = interpolated(a, b, batch.times, batch.nodes, pose=True, rate=True)
         error = lie.log(lie.inverse(batch.T_map_node) @ found.T)
         right = lie.right_jacobian_inverse(error)
         squared = np.einsum('mi,mij,mj->m', error, batch.information, error)
-        weight = self.weights[batch.sensors] / (1.0 + squared / self.cauchy**2)
+        beyond = np.maximum(squared - self.plain, 0.0)
+        weight = self.weights[batch.sensors] / (1.0 + beyond / self.cauchy**2)
         for m, (columns, by) in enumerate(self._constants(batch, found, error, of)):
             rows = np.empty(24, np.int64)
             rows_in_time(batch.nodes[m], self.grid.dim, rows)
@@ -100,6 +103,12 @@ class TrackerFactor(_PoseFactor):
         super().__init__(setup, [sensor.name for sensor in setup.robot.trackers])
         options = self.settings.tracker
         self.cauchy = options.cauchy
+        self.describe(setup.robot)
+        turn = np.radians(options.sigma_rotation_deg)
+        self._default = np.array([options.sigma_position] * 3 + [turn] * 3) ** -2.0
+
+    def describe(self, robot):
+        super().describe(robot)
         self._sensors = {
             sensor.name: (
                 number,
@@ -108,8 +117,6 @@ class TrackerFactor(_PoseFactor):
             )
             for number, sensor in enumerate(self.robot.trackers)
         }
-        turn = np.radians(options.sigma_rotation_deg)
-        self._default = np.array([options.sigma_position] * 3 + [turn] * 3) ** -2.0
 
     def row(self, measurement: TrackedPose) -> Row:
         number, node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, 'tracker')
@@ -138,33 +145,47 @@ class TrackerFactor(_PoseFactor):
         )
 
 
+def travel_of(measurement: EncoderSample, insertion: Insertion) -> float:
+    """Read the travel of the base [m]. Raises MeasurementError where it cannot be used."""
+    if insertion.mode != 'measured':
+        raise MeasurementError(
+            'not used', f"insertion is '{insertion.mode}' in the robot description"
+        )
+    if 'insertion' not in measurement.names:
+        raise MeasurementError(
+            'not used', f"no joint 'insertion' among {', '.join(measurement.names)}"
+        )
+    travel = float(measurement.position[measurement.names.index('insertion')])
+    require_finite(np.array(travel), 'insertion', 'joint_states')
+    if beyond := travel_cause(travel, insertion.range):
+        raise MeasurementError('beyond range', f"joint 'insertion' {beyond}")
+    return travel
+
+
 class InsertionFactor(_PoseFactor):
     """Base travel along its own x axis, from the joint state `insertion`."""
 
     name = 'insertion'
     consumes = EncoderSample
+    cauchy = 2.0  # an encoder that all the rest contradicts is let go, one within 5 sigma is not
+    plain = 9.0
 
     def __init__(self, setup):
         super().__init__(setup, ['insertion'])
+        if self.settings.calibration.enabled:
+            # A base that is a little off as built is no reason to let its encoder go.
+            built = setup.robot.tolerances.base_position / setup.robot.base.insertion.sigma
+            self.plain = self.plain * (1.0 + built**2)
 
     def row(self, measurement: EncoderSample) -> Row:
-        insertion = self.robot.base.insertion
-        if insertion.mode != 'measured':
-            raise MeasurementError(
-                'not used', f"insertion is '{insertion.mode}' in the robot description"
-            )
-        if 'insertion' not in measurement.names:
-            raise MeasurementError(
-                'not used', f"no joint 'insertion' among {', '.join(measurement.names)}"
-            )
-        travel = float(measurement.position[measurement.names.index('insertion')])
-        require_finite(np.array(travel), 'insertion', 'joint_states')
-        if beyond := travel_cause(travel, insertion.range):
-            raise MeasurementError('beyond range', f"joint 'insertion' {beyond}")
+        base = self.robot.base
+        insertion = base.insertion
+        travel = travel_of(measurement, insertion)
         T_map_base = self.robot.base.T_map_base.copy()
         T_map_base[:3, 3] += travel * T_map_base[:3, 0]
         information = np.zeros((6, 6))
-        information[0, 0] = insertion.sigma**-2.0
+        if base.mode == 'fixed':  # what a free one travels from is known at the start alone
+            information[0, 0] = insertion.sigma**-2.0
         return Row(0, 0, T_map_base, information)
 
     def _constants(self, batch, found, error, of):
@@ -172,6 +193,10 @@ class InsertionFactor(_PoseFactor):
         back = lie.adjoint(lie.inverse(batch.T_map_node) @ self.robot.base.T_map_base)
         for by in -lie.left_jacobian_inverse(error) @ back:
             yield columns, by
+
+    @classmethod
+    def wanted(cls, setup):
+        return setup.robot.base.mode != 'measured' and super().wanted(setup)
 
     def awaited(self):
         return self.robot.base.insertion.mode == 'measured'
@@ -194,7 +219,7 @@ def _add(normal, a, b, batch, loss, work):
         gp.evaluate(work, batch.times[m], True, 6)
         sensor = batch.sensors[m]
         weight = loss.weights[sensor]
-        u2, robust = _local(work, batch.T_map_node[m], batch.information[m], c2, local)
+        u2, robust = _local(work, batch.T_map_node[m], batch.information[m], loss, local)
         for i in range(6):
             local.g[i] *= weight
             for j in range(6):
@@ -206,14 +231,14 @@ def _add(normal, a, b, batch, loss, work):
         if m + 1 == batch.times.shape[0] or batch.nodes[m + 1] != n:
             rows_in_time(n, normal.g.shape[0] // 2, index)
             scatter(normal, index, total, 1.0)
-        own = 0.5 * u2 if np.isinf(loss.cauchy) else 0.5 * c2 * np.log1p(u2 / c2)
+        own = 0.5 * min(u2, loss.plain) + 0.5 * c2 * np.log1p(max(u2 - loss.plain, 0.0) / c2)
         cost += weight * own
         squared += u2 * robust
     return cost, squared
 
 
 @kernel
-def _local(work, T_measured, information, c2, local):
+def _local(work, T_measured, information, loss, local):
     """Write one pose's normal equations in its own frame; its squared error, and its weight."""
     at = work[0]
     gamma, J, scratch = at.gamma, at.right_gamma, at.scratch
@@ -223,7 +248,7 @@ def _local(work, T_measured, information, c2, local):
     u2 = 0.0
     for i in range(6):
         u2 += gamma.x[i] * weighted[i]
-    robust = 1.0 / (1.0 + u2 / c2)
+    robust = 1.0 / (1.0 + max(u2 - loss.plain, 0.0) / (loss.cauchy * loss.cauchy))
     lie_kernels.product(information, J, by_error)
     for i in range(6):
         local.g[i] = 0.0

@@ -191,9 +191,7 @@ def _add_border(border, a, b, s, batch, loss, columns, work):
         weight = loss.weight / (1.0 + u2 / c2)
         for i in range(2):
             for p in range(5):
-                WD[i, p] = weight * (
-                    information[i, 0] * D[0, p] + information[i, 1] * D[1, p]
-                )
+                WD[i, p] = weight * (information[i, 0] * D[0, p] + information[i, 1] * D[1, p])
                 coupled[m, i, p] += (1.0 - u) * WD[i, p]
                 coupled[m, 2 + i, p] += u * WD[i, p]
         for p in range(5):

@@ -85,7 +85,7 @@ class Optical(NamedTuple):
     """
     What the constants of S sensors are measured by.
 
-    columns: (S, 15) places of mount, range, clock and map in theta; T_ring_sensor: (S, 4, 4);
+    columns: (S, 16) places of mount, range, clock, delay and map in theta; T_ring_sensor: (S, 4, 4);
     along: (Z,) one over the share of a zone's range that is measured; T_map_middle: (4, 4).
     """
 
@@ -115,14 +115,7 @@ class TofFactor(Factor):
         self.surface = setup.surface
         self._repeats = Repeats(MOST_REPEATS)
         self._optical: tuple[Parameters, Optical] | None = None
-        self._sensors = {
-            sensor.name: (
-                number,
-                self.grid.node_at(self.robot.sensor_arclength(sensor.name)),
-                sensor.mount.T_ring_sensor,
-            )
-            for number, sensor in enumerate(self.robot.tof)
-        }
+        self.describe(setup.robot)
         model, options = self.robot.tof_model, self.settings.tof
         self._optics = Optics(
             model.min_range,
@@ -144,6 +137,17 @@ class TofFactor(Factor):
     @classmethod
     def wanted(cls, setup):
         return super().wanted(setup) and setup.prior_map is not None and bool(setup.robot.tof)
+
+    def describe(self, robot):
+        super().describe(robot)
+        self._sensors = {
+            sensor.name: (
+                number,
+                self.grid.node_at(self.robot.sensor_arclength(sensor.name)),
+                sensor.mount.T_ring_sensor,
+            )
+            for number, sensor in enumerate(self.robot.tof)
+        }
 
     @property
     def tight(self):
@@ -203,10 +207,11 @@ class TofFactor(Factor):
         if self._optical is None or self._optical[0] is not of:
             self._optical = of, self._optical_of(of)
         optical = self._optical[1]
-        _add_border(border, a, b, batch, self.weights, self.surface, self.rules, optical, self._work)
+        planes, rules = self.surface.planes, self.rules
+        _add_border(border, a, b, batch, self.weights, planes, rules, optical, self._work)
 
     def _optical_of(self, of):
-        kinds = [of.columns(kind, self.sensors) for kind in ('mount', 'range', 'clock')]
+        kinds = [of.columns(kind, self.sensors) for kind in ('mount', 'range', 'clock', 'delay')]
         columns = np.hstack([*kinds, np.tile(of.columns('map', ['']), (len(self.sensors), 1))])
         T_map_middle = np.eye(4)
         T_map_middle[:3, 3] = of.middle
@@ -221,9 +226,9 @@ class TofFactor(Factor):
 
 
 @kernel
-def _add_border(border, a, b, batch, weights, surface, rules, optical, work):
+def _add_border(border, a, b, batch, weights, planes, rules, optical, work):
     """Add what each frame says of mount, range and clock of its sensor, and of the map."""
-    local, M = new_normal(8), np.zeros((8, 15))
+    local, M = new_normal(8), np.zeros((8, 16))
     back, Ad = np.empty((4, 4)), np.empty((6, 6))
     index, related = np.empty(24, np.int64), -1
     M[6, 6] = M[7, 7] = 1.0
@@ -236,15 +241,15 @@ def _add_border(border, a, b, batch, weights, surface, rules, optical, work):
         gp.evaluate(work, batch.times[f], True, 6)
         at = work[0]
         unit = Unit(optical.T_ring_sensor[s, :3, 3], optical.along)
-        weigh_ranges(at.T, frame, weights[s], surface.planes, rules, unit, local)
+        weigh_ranges(at.T, frame, weights[s], planes, rules, unit, local)
         lie_kernels.adjoint(optical.T_ring_sensor[s], Ad)
         M[:6, :6] = Ad
-        M[:6, 8] = at.v
+        M[:6, 8] = M[:6, 9] = at.v
         lie_kernels.relative(at.T, optical.T_map_middle, back)
         lie_kernels.adjoint(back, Ad)
         for i in range(6):
             for j in range(6):
-                M[i, 9 + j] = -Ad[i, j]
+                M[i, 10 + j] = -Ad[i, j]
         add_local(border, index, at.J_pose, optical.columns[s], M, local)
 
 

@@ -20,7 +20,16 @@ import numpy as np
 
 # What an overloaded node gives up first. IMU samples go last: they carry the motion between all
 # others.
-SACRIFICE = ('tof/points', 'strain', 'imu/mag', TRACKER, 'joint_states', 'imu/data_raw')
+SACRIFICE = (
+    'tof/points',
+    'strain',
+    'imu/mag',
+    TRACKER,
+    'joint_states',
+    'base/odom',
+    'base/pose',
+    'imu/data_raw',
+)
 
 
 class Queued(NamedTuple):

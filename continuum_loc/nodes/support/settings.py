@@ -98,6 +98,11 @@ class SimulatorNodeSettings(Settings):
     tof_fidelity: Literal['paper', 'vl53l5cx'] = Field(
         'paper', description='how the ToF sensors are modelled'
     )
+    world: str = Field(
+        'ideal',
+        description='`ideal`, `disturbed`, `disturbed:part+part`, or a file of true departures '
+        'from the descriptions',
+    )
     seed: int = Field(0, ge=0, description='seed of all noise')
     duration: float = Field(
         0.0, ge=0.0, description="data time after which the node ends; 0 for the trajectory's [s]"

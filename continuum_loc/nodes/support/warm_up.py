@@ -12,6 +12,7 @@ from continuum_loc.estimator.filter import SlidingWindowFilter
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.measurements import (
+    BaseSample,
     EncoderSample,
     FieldSample,
     ImuSample,
@@ -44,6 +45,8 @@ def rest_samples(
     for step in range(round(duration / tick)):
         stamp = start + nanoseconds(step * tick)
         yield from _inertial(robot, stamp, rng)
+        if robot.base.mode == 'measured':
+            yield BaseSample(stamp, robot.base.measurement.frame, robot.base.T_map_base)
         if robot.base.insertion.mode == 'measured':
             yield EncoderSample(stamp, ('insertion',), np.zeros(1), np.zeros(1))
         if _due(step, tick, robot.strain.rate if robot.strain else 0.0):

@@ -11,8 +11,8 @@ import codecs
 import re
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.formats.numbers import table_of, text_of
-from continuum_loc.mapping.formats.shapes import Mesh, mesh_of
+from continuum_loc.formats.numbers import table_of, text_of
+from continuum_loc.formats.shapes import Mesh, mesh_of
 import numpy as np
 
 HEAD, TRIANGLE = 84, 50  # bytes

@@ -14,8 +14,8 @@ import struct
 
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.formats.numbers import cut_error, may_be_cut, table_of, text_of
-from continuum_loc.mapping.formats.shapes import canonical, check_rest, Cloud, cloud_of, USED
+from continuum_loc.formats.numbers import cut_error, may_be_cut, table_of, text_of
+from continuum_loc.formats.shapes import canonical, check_rest, Cloud, cloud_of, USED
 import numpy as np
 
 LONGEST_HEADER = 100_000  # bytes

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 import re
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.formats.numbers import (
+from continuum_loc.formats.numbers import (
     cut_error,
     index_may_be_cut,
     may_be_cut,
     table_of,
     text_of,
 )
-from continuum_loc.mapping.formats.shapes import (
+from continuum_loc.formats.shapes import (
     canonical,
     check_rest,
     Cloud,

@@ -1,14 +1,13 @@
 """
-Write config/*.yaml from the typed settings, so that defaults are written down once.
+Write the nodes' YAML files from their typed settings, so that defaults are written down once.
 
-    python -m continuum_loc.nodes.support.write_config config
+    python config/write.py
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-import sys
 from typing import Any
 
 from continuum_loc.nodes.support.parameters import constraint, leaves
@@ -47,7 +46,7 @@ def config_text(node: str) -> str:
     """Write the commented YAML of a node's parameters at their defaults."""
     head = (
         f'# Parameters of node `{node}` at their defaults, '
-        'by `python -m continuum_loc.nodes.support.write_config`.\n'
+        'by `python config/write.py`.\n'
         f'#   ros2 run continuum_loc {node} --ros-args --params-file {node}.yaml -p name:=value\n'
         '# [live] may change while the node runs (`ros2 param set`); the others are refused then.'
         '\n/**:\n  ros__parameters:\n'
@@ -86,11 +85,9 @@ def _text(value: Any) -> str:
 
 
 def main() -> None:
-    """Write all files into the folder given."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else 'config')
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write all files beside this one."""
     for node in NODES:
-        (folder / f'{node}.yaml').write_text(config_text(node))
+        Path(__file__).with_name(f'{node}.yaml').write_text(config_text(node))
 
 
 if __name__ == '__main__':

@@ -9,14 +9,14 @@ from __future__ import annotations
 import re
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.formats.numbers import (
+from continuum_loc.formats.numbers import (
     cut_error,
     index_may_be_cut,
     may_be_cut,
     table_of,
     text_of,
 )
-from continuum_loc.mapping.formats.shapes import check_finite, doubled, Mesh, mesh_of, triangles_of
+from continuum_loc.formats.shapes import check_finite, doubled, Mesh, mesh_of, triangles_of
 import numpy as np
 
 _PROMISE = re.compile(r'#.*\b(vertices|faces|triangles)\s*:\s*(\d+)\s*$', re.IGNORECASE)

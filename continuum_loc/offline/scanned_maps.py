@@ -1,8 +1,8 @@
 """
-Trials in a world that departs from the estimator's files: the true world, and the scanned map.
+Maps as a scanner makes them of a place, in a frame that is a little off.
 
-The estimator gets the nominal robot, its own settings, the samples and the map; nothing else of
-what is drawn here.
+In a world that departs from the estimator's files the estimator gets such a map; of what is drawn
+here it learns nothing else.
 """
 
 from __future__ import annotations
@@ -10,74 +10,25 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from continuum_loc import lie
+from continuum_loc.closure import digest_of_code
 from continuum_loc.mapping.build import local_shape
 from continuum_loc.mapping.map_files import load_map
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.robot import RobotDescription
-from continuum_loc.simulator.departures import (
-    Departures,
-    magnet_error,
-    Scan,
-    sensor_departures,
-    stream_of,
-    tof_settings,
-    true_plant,
-    true_robot,
-)
+from continuum_loc.simulator.departures import Departures, Scan, stream_of
 import numpy as np
 from scipy.spatial import cKDTree
-
-if TYPE_CHECKING:
-    from continuum_loc.simulator.scene import Scene
-    from continuum_loc.simulator.world import World
-
-
-def true_world(
-    robot: RobotDescription,
-    scene: Scene | None,
-    trajectory: str,
-    departures: Departures,
-    *,
-    seed: int,
-    fidelity: str = 'paper',
-    plant: str | Path | None = None,
-    profile: str = 'live',
-    faults: tuple = (),
-) -> World:
-    """
-    Make the world as it truly is, of a robot as it is described.
-
-    The drives pull as the nominal plant has it: what the true one does with that is its own.
-    """
-    from continuum_loc.simulator.plant import load_plant
-    from continuum_loc.simulator.trajectories import trajectory as path_of
-    from continuum_loc.simulator.world import World
-
-    fidelity, nominal = departures.fidelity(fidelity), load_plant(plant or robot.name)
-    return World(
-        true_robot(robot, departures, seed),
-        scene,
-        path_of(trajectory, robot, nominal),
-        plant=true_plant(nominal, departures, seed),
-        profile=profile,
-        tof_fidelity=fidelity,
-        tof_settings=tof_settings(departures, fidelity),
-        T_magnet_true=magnet_error(departures, seed),
-        seed=seed,
-        faults=(*faults, *sensor_departures(robot, departures, fidelity, seed)),
-    )
 
 
 def scanned_map_file(nominal: Path, departures: Departures, seed: int) -> Path:
     """
     Name the file of the map that the estimator is given in place of the `nominal` one.
 
-    It lies beside it, made once for each seed.
+    It lies beside it, made once for each seed by this code.
     """
-    said = f'{departures.scan!r} {departures.map_frame!r} {seed}'
+    code = digest_of_code(__name__, presets=False)
+    said = f'{departures.scan!r} {departures.map_frame!r} {seed} {code}'
     digest = hashlib.sha256(said.encode()).hexdigest()[:12]
     path = nominal.with_name(f'{nominal.stem}-scanned-{digest}.npz')
     if not path.is_file():

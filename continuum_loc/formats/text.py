@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import re
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.formats.numbers import (
+from continuum_loc.formats.numbers import (
     cut_error,
     may_be_cut,
     refuse_decimal_commas,
     table_of,
     text_of,
 )
-from continuum_loc.mapping.formats.shapes import (
+from continuum_loc.formats.shapes import (
     canonical,
     Cloud,
     cloud_of,

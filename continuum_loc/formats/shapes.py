@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from continuum_loc.errors import MapError
-from continuum_loc.mapping.prior_map import FARTHEST
 import numpy as np
 
+FARTHEST = 1e9  # m: of a coordinate; squares and cubes of it can still be computed with
 NORMAL = ('nx', 'ny', 'nz')
 UNIT = 0.02  # how far the length of a normal may be from 1: two decimals, or one signed byte
 # Other programs' names of ours; `points:0` and `normals:0` are ParaView's.
@@ -154,6 +154,15 @@ def check_finite(
             f'{where}: {len(bad)} of {len(rows)} {name} are not finite, the first is '
             f'number {bad[0]} ({place(int(bad[0]))}); remove them or repair the file'
         )
+
+
+def finite_rows(rows: np.ndarray, name: str, where: str) -> np.ndarray:
+    """Return rows (N, 3), at least one, as float64 in one block. Raises MapError for others."""
+    rows = np.ascontiguousarray(rows, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0:
+        raise MapError(f'{where}: {name} must be (N, 3) with N >= 1, got {rows.shape}')
+    check_finite(rows, name, where)
+    return rows
 
 
 def check_near(points: np.ndarray, where: str, place: Callable[[int], str] = _counted) -> None:
