@@ -97,7 +97,7 @@ class BaseWatch:
         return self._window.chain.covariance(last - 1, np.zeros(J.shape), J)
 
     def _lasting(self) -> np.ndarray:
-        """Covariance (6, 6) that constants of the robot leave on the base, if they are estimated."""
+        """Covariance (6, 6) that estimated constants of the robot leave on the base."""
         return np.zeros((6, 6)) if self.spread is None else self.spread(np.array([0]))[0]
 
     def _off(self, e: np.ndarray, J: np.ndarray, words: str) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 
 class Border(NamedTuple):
-    """C (n, P) couples n offsets with the constants; H (P, P), all of it, and g (P,) are theirs."""
+    """C (n, P) couples n offsets with the constants; H (P, P) and g (P,) are theirs alone."""
 
     C: np.ndarray
     H: np.ndarray
@@ -51,6 +51,17 @@ class Border(NamedTuple):
         self.C[np.ix_(rows, columns)] += J.T @ weighted
         self.H[np.ix_(columns, columns)] += D.T @ weighted
         self.g[columns] += e @ weighted
+
+    def level(self, columns: np.ndarray) -> None:
+        """
+        Count some constants (places in theta) from their mean, which then nothing is said of.
+
+        A common lateness is no more than another time. That it seems to show, in the linearised
+        equations, is what they miss: the motion's prior resists a shift of a motion as it would
+        resist that motion once more.
+        """
+        for part in (self.C, self.H, self.H.T, self.g[None]):
+            part[:, columns] -= part[:, columns].mean(axis=1, keepdims=True)
 
 
 @kernel

@@ -19,7 +19,7 @@ from __future__ import annotations
 from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.chain import Chain
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.normal import symmetric
+from continuum_loc.estimator.normal import Normal, symmetric
 from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.settings import CalibrationSettings
 from continuum_loc.estimator.state import Column, NODE_DIM
@@ -27,6 +27,7 @@ from continuum_loc.estimator.window import Window
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+TINY = 1e-12
 NOTABLE = 0.25  # of its standard deviation, by which a constant changes before that is acted on
 
 
@@ -46,6 +47,11 @@ class Calibrator:
         self._known = np.diag(parameters.sigma**-2.0), np.zeros(parameters.size)
         self._sensitivity: np.ndarray | None = None
         self._lateness = {name: parameters.lateness(name) for name in parameters.boards}
+        self._apart = np.eye(parameters.size)  # theta with its clocks counted from their mean
+        self._apart[np.ix_(parameters.clocks, parameters.clocks)] -= 1.0 / max(
+            len(parameters.clocks), 1
+        )
+        self._timing = np.flatnonzero(np.any(list(self._lateness.values()), axis=0))
         self._seen, self._next = 0, settings.period
         window.on_forgetting = self._carry_on
 
@@ -70,17 +76,43 @@ class Calibrator:
         if chain.border is None or time < self._next:
             return None
         self._next = time + self._settings.period
+        share = self._settings.period / self._settings.drift
+        self._wander(np.arange(len(self.theta)), share * self.parameters.sigma**2)
         past, start = chain.border, chain.marginals[0]
         W = cho_solve(cho_factor(symmetric(start.H)), past.C)
         H, g = past.H - past.C.T @ W, past.g - start.g @ W
         self._known, self._sensitivity = (H, g), W
         self.covariance = np.linalg.inv(H)
-        step = -self.covariance @ g
+        step = self._centred(-self.covariance @ g)
         notable = np.abs(step) > NOTABLE * np.sqrt(np.diag(self.covariance))
         return step if notable.any() else None
 
+    def _centred(self, step: np.ndarray) -> np.ndarray:
+        """Choose of all steps that tell the same the one that leaves most clocks right."""
+        clocks = self.parameters.clocks
+        if len(clocks):
+            step[clocks] -= np.median((self.theta + step)[clocks])
+        return step
+
+    def _wander(self, at: np.ndarray, variance: np.ndarray) -> None:
+        """
+        Let the constants `at` (m,) have wandered with a variance (m,).
+
+        With noise of covariance Q the past [x; theta] has, for theta after it, the information
+        [Lambda - C M C^T, C - C M H; H - H M H] where M = (Q^-1 + H)^-1 of those that wandered.
+        """
+        chain = self._window.chain
+        (C, H, g), start = chain.border, chain.marginals[0]
+        M = np.linalg.inv(H[np.ix_(at, at)] + np.diag(1.0 / variance))
+        MH, MC, Mg = M @ H[at], M @ C[:, at].T, M @ g[at]
+        chain.marginals[0] = Normal(np.triu(start.H - C[:, at] @ MC), start.g - C[:, at] @ Mg)
+        chain.border = Border(C - C[:, at] @ MH, H - H[:, at] @ MH, g - H[:, at] @ Mg)
+        self._window.intervals[0].changed = True
+
     def take(self, step: np.ndarray) -> Parameters:
         """Count the constants from where they now are; returns their parameters there."""
+        # What was linearised about other clocks is worth less: the body turns meanwhile.
+        self._wander(self._timing, np.square(step[self._timing]) + TINY)
         chain = self._window.chain
         chain.border.g[:] += chain.border.H @ step
         chain.marginals[0].g[:] += chain.border.C @ step
@@ -94,7 +126,9 @@ class Calibrator:
         """Name sensors whose clocks are off by `least` [s] and by so many standard deviations."""
         found = {}
         for name, by in self._lateness.items():
-            offset, sigma = float(by @ self.theta), float(np.sqrt(by @ self.covariance @ by))
+            apart = self._apart @ by
+            offset = float(by @ self.theta)
+            sigma = float(np.sqrt(apart @ self.covariance @ apart))
             if abs(offset) > least and abs(offset) > sigmas * sigma:
                 found[name] = offset
         return found

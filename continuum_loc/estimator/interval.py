@@ -67,13 +67,14 @@ class Interval:
         return self._scores.get(factor)
 
     def bordered(self, priors: Priors, a: Column, b: Column, of: Parameters) -> Border:
-        """What priors and measurements say of the constants `of` the robot, as linearised."""
+        """Say what priors and measurements tell of the constants `of` the robot, linearised."""
         dim = len(self.normal.g) // 2
         border = Border.zeros(2 * dim, of.size)
         newer = Border(border.C[dim:], border.H, border.g)
         priors.bordered(newer, b, priors.share(b.time - a.time), of)
         for factor, batch in self._batches.items():
             factor.bordered(batch, a, b, border, of)
+        border.level(of.clocks)
         return border
 
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:

@@ -18,6 +18,7 @@ They come in blocks of one kind and name. Each says how far it may be off by the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 from continuum_loc import lie
@@ -73,6 +74,11 @@ class Parameters:
                 at = slice(self.size, self.size + len(sigma))
                 self.blocks.append(Block(kind, name, at, sigma))
                 self._places[kind, name] = at
+
+    @cached_property
+    def clocks(self) -> np.ndarray:
+        """Places in theta of the boards' clocks, of which differences alone can be told."""
+        return np.array([one.at.start for one in self.blocks if one.kind == 'clock'], np.int64)
 
     @property
     def size(self) -> int:

@@ -222,7 +222,7 @@ class Priors:
         return cost, jerked
 
     def share(self, duration: float) -> float:
-        """What rest strain and base pose count by at a knot so long after another [s]."""
+        """Say what rest strain and base pose count by at a knot so long after another [s]."""
         return min(duration / self.memory, 1.0)
 
     def bordered(self, border: Border, column: Column, share: float, of: Parameters) -> None:

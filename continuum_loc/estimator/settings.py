@@ -306,8 +306,14 @@ class CalibrationSettings(Settings):
     period: float = Field(
         1.0, gt=0.0, description='time between two changes of what measurements are taken for [s]'
     )
+    drift: float = Field(
+        3600.0,
+        gt=0.0,
+        description='time in which a constant may wander off by its tolerance: a mount that is '
+        'knocked, a sensor that warms up [s]',
+    )
     least: float = Field(
-        0.3,
+        0.5,
         ge=0.0,
         le=1.0,
         description='share of its tolerance down to which a constant can be known: what the model '

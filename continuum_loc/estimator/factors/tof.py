@@ -85,7 +85,7 @@ class Optical(NamedTuple):
     """
     What the constants of S sensors are measured by.
 
-    columns: (S, 16) places of mount, range, clock, delay and map in theta; T_ring_sensor: (S, 4, 4);
+    columns: (S, 16) places of mount, range, clock, delay and map; T_ring_sensor: (S, 4, 4);
     along: (Z,) one over the share of a zone's range that is measured; T_map_middle: (4, 4).
     """
 
