@@ -265,7 +265,7 @@ class SlidingWindowFilter:
 
     def _status(self) -> Status:
         """Say what to tell of the body; nothing but an undisputed fit is tracking."""
-        status = self.recovery.status
+        status = 'lost' if self.start.astray else self.recovery.status
         return 'doubtful' if status == 'tracking' and self.doubts.reasons else status
 
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:

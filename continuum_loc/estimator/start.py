@@ -21,7 +21,7 @@ import numpy as np
 FIRST = 0.3  # [s] of data before the first search
 AGAIN = 0.5  # [s] between two searches
 CONFIRM = 0.4  # [s] that a body has to fit before it is told
-KIDNAPPED, PATIENCE = 0.6, 0.25  # share of fitting zones below which, for so long [s], it is lost
+KIDNAPPED, PATIENCE = 0.6, 0.12  # share of fitting zones below which, for so long [s], it is lost
 ACCELERATIONS = 50  # samples of each IMU whose mean says what is up
 STEADY = 1.0  # [m/s^2] the mean may be from gravity
 GRAVITY = 9.81
@@ -61,6 +61,11 @@ class Start:
             if np.isfinite(force).all():
                 kept = self._forces.setdefault(measurement.sensor, deque(maxlen=ACCELERATIONS))
                 kept.append(force)
+
+    @property
+    def astray(self) -> bool:
+        """Whether the body fits so badly just now that it may have been carried off."""
+        return self._since is not None
 
     def due(self, time: float) -> bool:
         """Whether it is time for a search."""
