@@ -1,8 +1,9 @@
 """
 The robot description: geometry, sensors and datasheet noise, from one validated YAML file.
 
-It serves the simulator and the estimator alike. What only the true plant knows (stiffness, mass,
-friction, faults) lives in the simulator's plant files, so that the estimator cannot peek.
+It serves the simulator and the estimator alike. What only the true plant knows (its stiffness,
+mass, friction, faults) lives in the simulator's plant files, so that the estimator cannot peek;
+what is believed of them is the block `actuation`.
 
 Frames: body x is the backbone's tangent. The frame of a ring is the backbone frame at the ring's
 arclength; a sensor's pose on its ring is `T_ring_sensor`. A ToF sensor's optical axis is its x.
@@ -15,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from continuum_loc.actuation import Actuation
 from continuum_loc.settings import load_bundled, Name, Settings
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -360,6 +362,7 @@ class RobotDescription(Settings):
     hall: tuple[Sensor, ...] = ()
     magnet: Magnet | None = None
     trackers: tuple[Sensor, ...] = ()
+    actuation: Actuation | None = None
 
     @model_validator(mode='after')
     def _consistent(self) -> RobotDescription:
@@ -387,6 +390,8 @@ class RobotDescription(Settings):
                 )
         for sensor in self.tof:
             self._check_outside(sensor)
+        if self.actuation is not None:
+            self.actuation.check(self.length, self.radius, self.backbone.module_ends)
         return self
 
     def _check_outside(self, sensor: Sensor) -> None:
