@@ -120,6 +120,7 @@ TOPICS: dict[str, Topic] = {
         lambda make, item: results.tip_message(make, tip_of(item), 'tip'),
         _read(results.tip_record),
     ),
+    'base/hypotheses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(results.poses_record)),
     'base/frame': Topic(_POSE, results.frame_message, _read(results.frame_record)),
     RING_POSE: Topic(_POSE, convert.tracker_message, _pose_of_one),
     RING_TWIST: Topic(
@@ -160,6 +161,7 @@ OUTPUTS = (
     'backbone',
     'tip',
     'base/frame',
+    'base/hypotheses',
     RING_POSE,
     RING_TWIST,
     'reconstruction',
