@@ -410,6 +410,52 @@ def tune(
     console.print(f'written {out}')
 
 
+@app.command()
+def identify(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(help='bags, or CSV tables of motors and tip positions, of one robot'),
+    ],
+    out: Annotated[Path, typer.Option(help='description to write (YAML)')],
+    robot: Robot = 'engine',
+    arm: Annotated[
+        float | None,
+        typer.Option(help='distance of tendons from the backbone [m], where none are described'),
+    ] = None,
+    test: Annotated[
+        list[Path] | None, typer.Option(help='recording that is only predicted, not fitted')
+    ] = None,
+) -> None:
+    """
+    Find which motor is which tendon, angles, offsets, stiffness, friction, and the tip's marker.
+
+    Reads `joint_states` and the position of a tracker on the last ring, or the truth. The robot
+    says its length and where its modules end; a block `actuation` that it has is the start.
+
+    Example: `continuum-loc identify moves.csv --robot arm.yaml --arm 0.0045 --out found.yaml`
+    """
+    from continuum_loc.offline.identified import identify as run_identify
+    from continuum_loc.offline.identified import predict, read_recording, rmse
+    from continuum_loc.offline.motor_csv import together
+    from continuum_loc.robot import load_robot
+    from continuum_loc.settings import dump_settings
+
+    description = load_robot(robot)
+    recording = together([read_recording(path, description) for path in recordings])
+    with _busy() as status:
+        found = run_identify(description, recording, arm, status.update)
+    dump_settings(found.robot, out)
+    for name, value in found.figures().items():
+        console.print(f'{name:34}{value:.2f}', highlight=False)
+    for path in test or ():
+        error, nees = predict(found.robot, read_recording(path, description))
+        said = f'{path}: tip RMSE {rmse(error):.2f} mm, NEES/dof {nees.mean():.2f}'
+        console.print(said, highlight=False, soft_wrap=True)
+    for finding in found.findings:
+        console.print(finding, highlight=False, soft_wrap=True)
+    console.print(f'written {out}')
+
+
 def _tell_sweep(start: Trying, best: Trying) -> None:
     for name, one in (('start', start), ('best', best)):
         console.print(

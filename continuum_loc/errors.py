@@ -61,6 +61,10 @@ class QueryError(InputError):
     """An instant or a place of which an estimator can say nothing."""
 
 
+class FrameError(InputError):
+    """Frames between which there is no way, or none at that time."""
+
+
 class TrajectoryError(InputError):
     """A trajectory, or a file of one."""
 

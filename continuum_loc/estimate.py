@@ -31,6 +31,8 @@ class Estimate:
     honest).
     inliers: share of usable zones that fit the map, by ToF sensor.
     suspects: why a sensor is not to be believed, by name.
+    T_map_frame: (4, 4) pose of the frame in which a carried base is measured, `map -> odom` where
+    that is odometry; None where the base is not measured. frame_covariance: (6, 6) of it.
     lagged: the same body at `stamp - lag`, smoothed by everything since; None before there is one.
     """
 
@@ -51,6 +53,8 @@ class Estimate:
     converged: bool = True
     step_seconds: float = 0.0
     lagged: Estimate | None = None
+    T_map_frame: np.ndarray | None = None
+    frame_covariance: np.ndarray | None = None
 
     @property
     def least_known(self) -> tuple[int, float, np.ndarray]:

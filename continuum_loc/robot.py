@@ -1,8 +1,9 @@
 """
 The robot description: geometry, sensors and datasheet noise, from one validated YAML file.
 
-It serves the simulator and the estimator alike. What only the true plant knows (stiffness, mass,
-friction, faults) lives in the simulator's plant files, so that the estimator cannot peek.
+It serves the simulator and the estimator alike. What only the true plant knows (its stiffness,
+mass, friction, faults) lives in the simulator's plant files, so that the estimator cannot peek;
+what is believed of them is the block `actuation`.
 
 Frames: body x is the backbone's tangent. The frame of a ring is the backbone frame at the ring's
 arclength; a sensor's pose on its ring is `T_ring_sensor`. A ToF sensor's optical axis is its x.
@@ -15,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from continuum_loc.actuation import Actuation
 from continuum_loc.settings import load_bundled, Name, Settings
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -205,6 +207,11 @@ class Base(Settings):
     )
     insertion: Insertion = Insertion()
     measurement: BaseMeasurement = BaseMeasurement()
+    region: tuple[float, float] = Field(
+        (0.0, 0.0),
+        description='how far from there a free base may begin [m, deg]; with (0, 0) it begins '
+        'there, and 180 deg and a way that is longer than the map leave it anywhere in it',
+    )
     speed: tuple[float, float] = Field(
         (0.3, 0.5), description='how fast a carried base moves and turns, 1 sigma [m/s, rad/s]'
     )
@@ -212,6 +219,13 @@ class Base(Settings):
         (0.01, 0.03),
         description='white noise on the acceleration of a carried base [m^2/s^3, rad^2/s^3]',
     )
+
+    @field_validator('region')
+    @classmethod
+    def _not_negative(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if min(value) < 0.0:
+            raise ValueError('both must be 0 or greater')
+        return value
 
     @field_validator('speed', 'acceleration')
     @classmethod
@@ -421,6 +435,7 @@ class RobotDescription(Settings):
     magnet: Magnet | None = None
     trackers: tuple[Sensor, ...] = ()
     tolerances: Tolerances = Tolerances()
+    actuation: Actuation | None = None
 
     @model_validator(mode='after')
     def _consistent(self) -> RobotDescription:
@@ -448,6 +463,8 @@ class RobotDescription(Settings):
                 )
         for sensor in self.tof:
             self._check_outside(sensor)
+        if self.actuation is not None:
+            self.actuation.check(self.length, self.radius, self.backbone.module_ends)
         return self
 
     def _check_outside(self, sensor: Sensor) -> None:

@@ -22,7 +22,7 @@ from continuum_loc.measurements import NANOSECONDS
 from continuum_loc.yaml_files import check_yaml
 from msg_tools.factory import bag_messages, deserialize, typestore
 from msg_tools.mcap import close_cut
-from msg_tools.topics import cloud_topic_record, INPUTS, Topic, topic_spec, TOPICS, TRACKER
+from msg_tools.topics import cloud_topic_record, INPUTS, key_of, Topic, topic_spec, TOPICS
 
 BAG_SUFFIXES = ('.mcap', '.db3')
 _CLOUDS = ('reconstruction', 'prior_map')
@@ -320,14 +320,14 @@ def split_topic(name: str, type_name: str) -> tuple[str, str] | None:
     parts = name.strip('/').split('/')
     for cut in range(len(parts)):
         relative = '/'.join(parts[cut:])
-        key = TRACKER if parts[cut] + '/' == TRACKER and len(parts) - cut == 2 else relative
+        key = key_of(relative)
         if key in TOPICS and TOPICS[key].type == type_name:
             return '/'.join(parts[:cut]), relative
     return None
 
 
 def _selected(topic: str, topics: tuple[str, ...] | None) -> bool:
-    return topics is None or topic in topics or (TRACKER in topics and topic.startswith(TRACKER))
+    return topics is None or topic in topics or key_of(topic) in topics
 
 
 def _messages(path: Path, reader: Any, connections: list) -> Iterator[tuple[Any, int, bytes]]:

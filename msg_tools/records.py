@@ -39,6 +39,25 @@ class TipRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FrameRecord:
+    """`base/frame`: T_map_frame (4, 4) of a measured base's frame, and covariance (6, 6)."""
+
+    stamp: int
+    T_map_frame: np.ndarray
+    frame_covariance: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwistRecord:
+    """`ring_twist/<ring>`: body velocity (6,) [v; w] in the ring's own frame, and (6, 6)."""
+
+    stamp: int
+    frame: str
+    velocity: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CloudRecord:
     """
     `reconstruction` or `prior_map`: one (N,) array per field of the cloud.

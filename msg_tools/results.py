@@ -9,6 +9,7 @@ from msg_tools.clouds import cloud_array, columns_cloud
 from msg_tools.factory import Messages
 from msg_tools.geometry import (
     body_covariance,
+    frame_of,
     header_message,
     MAP,
     pose_message,
@@ -20,7 +21,15 @@ from msg_tools.geometry import (
     vector,
     vector_message,
 )
-from msg_tools.records import CloudRecord, DiagnosticsRecord, PathRecord, PosesRecord, TipRecord
+from msg_tools.records import (
+    CloudRecord,
+    DiagnosticsRecord,
+    FrameRecord,
+    PathRecord,
+    PosesRecord,
+    TipRecord,
+    TwistRecord,
+)
 import numpy as np
 
 
@@ -69,11 +78,6 @@ def tip_message(make: Messages, tip: TipRecord, child_frame: str) -> Any:
     REP-103.
     """
     covariance = ros_covariance(tip.covariance, tip.T_map_tip[:3, :3])
-    twist = make(
-        'geometry_msgs/msg/Twist',
-        linear=vector_message(make, tip.velocity[:3]),
-        angular=vector_message(make, tip.velocity[3:]),
-    )
     return make(
         'nav_msgs/msg/Odometry',
         header=header_message(make, tip.stamp, MAP),
@@ -83,11 +87,19 @@ def tip_message(make: Messages, tip: TipRecord, child_frame: str) -> Any:
             pose=pose_message(make, tip.T_map_tip),
             covariance=covariance,
         ),
+        twist=_twist(make, tip.velocity, tip.velocity_covariance),
+    )
+
+
+def _twist(make: Messages, velocity: np.ndarray, covariance: np.ndarray) -> Any:
+    return make(
+        'geometry_msgs/msg/TwistWithCovariance',
         twist=make(
-            'geometry_msgs/msg/TwistWithCovariance',
-            twist=twist,
-            covariance=np.ascontiguousarray(tip.velocity_covariance, float).reshape(36),
+            'geometry_msgs/msg/Twist',
+            linear=vector_message(make, velocity[:3]),
+            angular=vector_message(make, velocity[3:]),
         ),
+        covariance=np.ascontiguousarray(covariance, float).reshape(36),
     )
 
 
@@ -95,17 +107,55 @@ def tip_record(message: Any, where: str = 'tip') -> TipRecord:
     """Read the tip of an Odometry message in `map`."""
     require_map(message.header, where)
     T = transforms_of([message.pose.pose], where)[0]
-    velocity = np.concatenate(
-        [vector(message.twist.twist.linear), vector(message.twist.twist.angular)]
-    )
-    velocity_covariance = np.array(message.twist.covariance, float).reshape(6, 6)
     return TipRecord(
         stamp_of(message.header, where),
         T,
         body_covariance(message.pose.covariance, T[:3, :3], where),
-        velocity,
-        velocity_covariance,
+        *_velocity(message.twist),
     )
+
+
+def frame_message(make: Messages, item: Any) -> Any:
+    """PoseWithCovarianceStamped in `map` of a measured base's frame: an Estimate or a record."""
+    covariance = ros_covariance(item.frame_covariance, item.T_map_frame[:3, :3])
+    return make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        header=header_message(make, item.stamp, MAP),
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(make, item.T_map_frame),
+            covariance=covariance,
+        ),
+    )
+
+
+def frame_record(message: Any, where: str = 'base/frame') -> FrameRecord:
+    """Read where the frame of a measured base lies in `map`."""
+    require_map(message.header, where)
+    T = transforms_of([message.pose.pose], where)[0]
+    covariance = body_covariance(message.pose.covariance, T[:3, :3], where)
+    return FrameRecord(stamp_of(message.header, where), T, covariance)
+
+
+def twist_message(make: Messages, item: TwistRecord) -> Any:
+    """TwistWithCovarianceStamped, in the ring's own frame, which the header names."""
+    return make(
+        'geometry_msgs/msg/TwistWithCovarianceStamped',
+        header=header_message(make, item.stamp, item.frame),
+        twist=_twist(make, item.velocity, item.covariance),
+    )
+
+
+def twist_record(message: Any, where: str = 'twist') -> TwistRecord:
+    """Read a body velocity in the frame that the header names."""
+    frame = frame_of(message.header, where)
+    return TwistRecord(stamp_of(message.header, where), frame, *_velocity(message.twist))
+
+
+def _velocity(twist: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(6,) [v; w] and (6, 6) of a TwistWithCovariance."""
+    velocity = np.concatenate([vector(twist.twist.linear), vector(twist.twist.angular)])
+    return velocity, np.array(twist.covariance, float).reshape(6, 6)
 
 
 def columns_message(make: Messages, cloud: CloudRecord, frame_id: str = MAP) -> Any:

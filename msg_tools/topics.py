@@ -21,7 +21,13 @@ from msg_tools import convert, results
 from msg_tools.factory import Messages
 from msg_tools.records import CloudRecord, PosesRecord, TipRecord
 
-TRACKER = 'tracker/'
+TRACKER, RING_POSE, RING_TWIST = 'tracker/', 'ring_pose/', 'ring_twist/'
+# Topics of which there is one for each sensor or ring, and how they are called as a whole.
+FAMILIES = {
+    TRACKER: 'tracker/<sensor>',
+    RING_POSE: 'ring_pose/<ring>',
+    RING_TWIST: 'ring_twist/<ring>',
+}
 
 
 @dataclass(frozen=True)
@@ -72,8 +78,8 @@ def _strain(message: Any, arrival: int | None, where: str) -> Any:
     return convert.strain_sample(message, arrival, where)
 
 
-def _tracker(message: Any, arrival: int | None, where: str) -> Any:
-    return convert.tracked_pose(message, where.rpartition(TRACKER)[2], where)
+def _pose_of_one(message: Any, arrival: int | None, where: str) -> Any:
+    return convert.tracked_pose(message, where.rpartition('/')[2], where)
 
 
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -93,7 +99,7 @@ TOPICS: dict[str, Topic] = {
         depth=1024,
     ),
     'strain': Topic('std_msgs/msg/Float64MultiArray', convert.strain_message, _strain, depth=128),
-    TRACKER: Topic(_POSE, convert.tracker_message, _tracker, depth=512),
+    TRACKER: Topic(_POSE, convert.tracker_message, _pose_of_one, depth=512),
     'joint_states': Topic(
         'sensor_msgs/msg/JointState',
         convert.encoder_message,
@@ -113,6 +119,14 @@ TOPICS: dict[str, Topic] = {
         'nav_msgs/msg/Odometry',
         lambda make, item: results.tip_message(make, tip_of(item), 'tip'),
         _read(results.tip_record),
+    ),
+    'base/hypotheses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(results.poses_record)),
+    'base/frame': Topic(_POSE, results.frame_message, _read(results.frame_record)),
+    RING_POSE: Topic(_POSE, convert.tracker_message, _pose_of_one),
+    RING_TWIST: Topic(
+        'geometry_msgs/msg/TwistWithCovarianceStamped',
+        results.twist_message,
+        _read(results.twist_record),
     ),
     'reconstruction': Topic(
         'sensor_msgs/msg/PointCloud2', results.columns_message, _read(results.cloud_record)
@@ -146,6 +160,10 @@ OUTPUTS = (
     'poses',
     'backbone',
     'tip',
+    'base/frame',
+    'base/hypotheses',
+    RING_POSE,
+    RING_TWIST,
     'reconstruction',
     'prior_map',
     'shape/poses',
@@ -174,18 +192,24 @@ def topic_of(sample: Any) -> str:
     return _SAMPLE_TOPICS[type(sample)]
 
 
+def key_of(name: str) -> str:
+    """Return the name in TOPICS of a relative topic: its family's, where it has one."""
+    head, slash, tail = name.partition('/')
+    return head + slash if head + slash in FAMILIES and tail and '/' not in tail else name
+
+
 def topic_spec(name: str) -> Topic:
     """
     Return the contract of a relative topic; `tracker/<sensor>` too.
 
     Raises MessageError listing the valid names.
     """
-    key = TRACKER if name.startswith(TRACKER) else name
-    if key not in TOPICS or name == TRACKER:
+    key = key_of(name)
+    if key not in TOPICS or name in FAMILIES:
         raise MessageError(
             'topic',
             f"no topic '{name}' in the contract; valid: "
-            + ', '.join('tracker/<sensor>' if topic == TRACKER else topic for topic in TOPICS),
+            + ', '.join(FAMILIES.get(topic, topic) for topic in TOPICS),
         )
     return TOPICS[key]
 

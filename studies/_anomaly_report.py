@@ -12,6 +12,7 @@ from continuum_loc.offline.report import chart, Page, Part, render
 from continuum_loc.offline.study_report import as_table, claims_part
 from continuum_loc.scene.anomalies import AnomalySettings
 import numpy as np
+from studies._paper_figures import html
 from studies._scene_result import SceneResult
 
 if TYPE_CHECKING:
@@ -51,10 +52,15 @@ def write_anomaly_report(
         *(
             [
                 Part(
+                    f'Scene {result.scene}: truth, prior map, reconstruction, and what was found',
+                    'As Figs. 5, 7 and 9 of the paper.',
+                    figure=html(result.picture),
+                ),
+                Part(
                     f'Scene {result.scene}',
                     'Coloured by depth; red: new, blue: missing. Outlined: what truly differs.',
                     figure=chart(scene_figure(result)),
-                )
+                ),
             ]
             for result in ranked[:MOST_SCENES]
         ),

@@ -16,7 +16,7 @@ class SceneResult:
     rmse_m: of the fused surfels, of the measured points, and of points placed by the true poses
     (the sensors' share) to the true mesh. covered: share of the surfels whose distance to it is
     within 3 standard deviations. truth: the known anomalies that were seen, of `known`. fused:
-    what the picture shows.
+    what the view to turn shows. picture: (H, W, 3) of `scene_picture`.
     """
 
     scene: str
@@ -28,3 +28,4 @@ class SceneResult:
     truth: list[Truth]
     known: int
     fused: np.ndarray
+    picture: np.ndarray

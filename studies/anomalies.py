@@ -31,6 +31,7 @@ from continuum_loc.scene.reconstruct import (
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np
 from studies._anomaly_report import write_anomaly_report
+from studies._paper_figures import scene_picture
 from studies._scene_result import SceneResult
 from studies.support.campaign import (
     bag_of,
@@ -143,16 +144,19 @@ def judge_scene(out: Path, folder: Path, scene_name: str, members: list[Trial]) 
             ('true poses', true.points[:: 1 + len(true.points) // JUDGED_POINTS]),
         )
     }
+    prior = load_map(trial_map_file(members[0]))
+    clusters = detect_anomalies(estimated, prior)
     return SceneResult(
         scene=scene_name,
         points=len(estimated.points),
         surfels=len(surface.points),
         rmse_m={name: root_mean_square(distance) for name, distance in off.items()},
         covered=float(np.mean(off['fused'] <= 3.0 * surface.sigma)),
-        clusters=detect_anomalies(estimated, load_map(trial_map_file(members[0]))),
+        clusters=clusters,
         truth=seen(wanted, true),
         known=len(wanted),
         fused=surface.points[:: max(1, len(surface.points) // SHOWN_SURFELS)],
+        picture=scene_picture(scene, prior.points, surface.points, clusters),
     )
 
 

@@ -8,6 +8,7 @@ from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import condition_table, mean, trial_rows
 from continuum_loc.offline.study_report import write_study_report
 from continuum_loc.offline.trials import Trial
+from studies._paper_figures import side_by_side
 from studies.support.campaign import Outcome, run_campaign
 from studies.support.split import HOLD_OUT, is_hold_out, require_unseen
 from studies.support.worlds import by_world, in_worlds, named, told
@@ -63,6 +64,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
         claims,
         {f'Errors by scene: {name}': table for name, table in tables.items()},
         outcomes,
+        pictures=side_by_side(out, outcomes),
     )
     return claims
 

@@ -12,6 +12,7 @@ from continuum_loc.offline.claims import at_most, Claim, write_study
 from continuum_loc.offline.error_tables import condition_table, mean, trial_rows
 from continuum_loc.offline.study_report import write_study_report
 from continuum_loc.offline.trials import GYRO_BIAS, MOUNTING_ERROR, TOF_CLOCK_OFFSET
+from studies._paper_figures import side_by_side
 from studies._soft_arm import (
     ADDED,
     condition,
@@ -81,6 +82,7 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
         claims,
         {f'Errors, sensors as {name}': tables[f'table3_{name}'] for name in conditions()},
         outcomes,
+        pictures=side_by_side(out, outcomes),
     )
     return claims
 

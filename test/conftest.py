@@ -25,7 +25,7 @@ class NodeModule(pytest.Module):
 
 
 def pytest_pycollect_makemodule(module_path, parent):
-    if re.search(r'^from (rclpy|node_graph)\b', module_path.read_text(), re.MULTILINE):
+    if re.search(r'^(from|import) (rclpy|node_graph)\b', module_path.read_text(), re.MULTILINE):
         return NodeModule.from_parent(parent, path=module_path)
     return None
 

@@ -20,7 +20,7 @@ from continuum_loc.measurements import (
     StrainSample,
     TofFrame,
 )
-from continuum_loc.nodes.support.runtime import output_qos
+from continuum_loc.nodes.support.quality import output_qos
 from continuum_loc.offline.domain import Domain
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages

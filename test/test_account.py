@@ -180,6 +180,7 @@ def shape(points, stamp=SECOND):
         'tracking',
         {},
         1.0,
+        np.eye(4),
     )
 
 

@@ -25,7 +25,8 @@ from std_srvs.srv import Trigger
 
 pytestmark = pytest.mark.timeout(300)
 INPUTS = ('tof/points', 'imu/data_raw', 'strain', 'joint_states')
-OUTPUTS = ('poses', 'backbone', 'tip', 'reconstruction', '/diagnostics')
+RINGS = ('ring_pose/ring2', 'ring_twist/ring2', 'ring_pose/base')
+OUTPUTS = ('poses', 'backbone', 'tip', 'reconstruction', '/diagnostics', *RINGS)
 
 
 @pytest.fixture(scope='module')
@@ -90,6 +91,12 @@ def test_every_output_comes_and_is_right(fresh, box):
     tip = client.heard['tip'][-1]
     np.testing.assert_allclose(tip.T_map_tip, poses[-1].T_map_body[-1], atol=1e-6)
     assert np.linalg.eigvalsh(tip.covariance).min() > 0.0 and np.abs(tip.velocity).max() < 0.1
+    stamps_of_poses = [pose.stamp for pose in poses]
+    for topic in RINGS:  # one for each of `poses`
+        assert [item.stamp for item in client.heard[topic]] == stamps_of_poses
+    alone = client.heard['ring_pose/ring2'][-1]
+    np.testing.assert_allclose(alone.T_map_sensor, tip.T_map_tip, atol=1e-9)
+    np.testing.assert_allclose(alone.covariance, tip.covariance, atol=1e-12)
     backbone = client.heard['backbone'][-1].T_map_backbone[:, :3, 3]
     steps = np.linalg.norm(np.diff(backbone, axis=0), axis=1)
     # Evenly spaced.
@@ -194,7 +201,7 @@ def test_parameters_are_described_and_guarded(graph):
     assert change('lag_warning', 0.2).successful
     assert change('filter.tof.gate', 0.11).successful
     for parameter, value, reason in (
-        ('robot', 'other', 'fixed while the node runs'),
+        ('robot', 'other', 'read-only'),
         ('lag_warning', 0.0, 'lag_warning'),
         ('lag_warning', 'text', 'type'),
         ('filter.tof.gate', -1.0, 'gate'),

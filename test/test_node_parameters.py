@@ -11,7 +11,7 @@ from config.write import config_text, NODES
 from continuum_loc.errors import SettingsError
 from continuum_loc.estimator import EstimatorSettings
 from continuum_loc.nodes.support import parameters
-from continuum_loc.nodes.support.runtime import PackageNode
+from continuum_loc.nodes.support.managed import PackageNode
 from continuum_loc.nodes.support.settings import EstimatorNodeSettings
 from continuum_loc.offline.domain import Domain
 import pytest
@@ -79,7 +79,8 @@ def test_values_given_at_the_start_are_taken_and_whole_numbers_serve_as_floats()
         ('lag_warning:=text', 'lag_warning'),
         ('lag_warning:=0.0', 'lag_warning'),
         ('intake.queue_capacity:=5', 'intake.queue_capacity'),
-        ('publish_tf:=7', 'publish_tf'),
+        ('warm_up:=7', 'warm_up'),
+        ('tf:=somehow', 'tf'),
     ],
 )
 def test_values_out_of_range_or_of_another_type_are_refused_by_name(argument, text):
@@ -112,14 +113,14 @@ def test_changes_at_run_time_are_asked_about():
 
     def apply(values):
         asked.append(values)
-        return 'not now' if 'robot' in values else None
+        return 'not now' if 'output_folder' in values else None
 
     with node_of(EstimatorNodeSettings()) as node:
         parameters.guard(node, apply)
         assert node.set_parameters([Parameter('lag_warning', value=0.5)])[0].successful
-        refused = node.set_parameters([Parameter('robot', value='x')])[0]
+        refused = node.set_parameters([Parameter('output_folder', value='x')])[0]
         assert not refused.successful and refused.reason == 'not now'
-        assert asked == [{'lag_warning': 0.5}, {'robot': 'x'}]
+        assert asked == [{'lag_warning': 0.5}, {'output_folder': 'x'}]
         assert parameters.read(node, EstimatorNodeSettings).lag_warning == 0.5
 
 
@@ -133,3 +134,46 @@ def test_the_yaml_of_every_node_is_in_step_with_its_settings(name):
     with node_of(NODES[name], '--params-file', str(CONFIG / f'{name}.yaml'), name=name) as node:
         node.check_parameters()
         assert node.settings == NODES[name]
+
+
+def test_what_may_not_change_is_read_only_and_may_be_set_to_what_it_is():
+    """So that `ros2 param load` of the node's own dump is accepted, and restarts nothing."""
+    asked = []
+    with node_of(EstimatorNodeSettings()) as node:
+        parameters.declare(node, EstimatorSettings(), 'filter.', live=True)
+        parameters.guard(node, lambda values: asked.append(values))
+        names = list(node._parameters)
+        fixed, changeable = node.describe_parameters(['robot', 'filter.tof.gate'])
+        assert fixed.read_only and not changeable.read_only
+        dump = [Parameter(name, value=node.get_parameter(name).value) for name in names]
+        assert len(dump) > 80
+        for result in node.set_parameters(dump):
+            assert result.successful, result.reason
+        assert asked == []
+        refused = node.set_parameters([Parameter('robot', value='soft_arm')])[0]
+        assert not refused.successful and 'read-only' in refused.reason
+
+
+@pytest.mark.parametrize(
+    ('given', 'meant'),
+    [
+        ('gate', 'filter.tof.gate'),
+        ('tof.gate', 'filter.tof.gate'),
+        ('max_backlogg', 'intake.max_backlog'),
+        ('filter.windw', 'filter.window'),
+        ('warmup', 'warm_up'),
+    ],
+)
+def test_the_nearest_name_may_lie_deeper(given, meant):
+    with node_of(EstimatorNodeSettings()) as node:
+        parameters.declare(node, EstimatorSettings(), 'filter.', live=True)
+        assert parameters.nearest(given, list(node._parameters)) == meant
+
+
+def test_quality_of_service_may_be_overridden():
+    depth = 'qos_overrides./poses.publisher.depth'
+    with node_of(EstimatorNodeSettings(), '-p', f'{depth}:=33') as node:
+        node.check_parameters()
+        node.publisher('poses')
+        assert node.get_parameter(depth).value == 33
+        assert node.get_publishers_info_by_topic('/poses')

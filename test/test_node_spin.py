@@ -6,7 +6,8 @@ import threading
 from types import FunctionType
 
 from continuum_loc.errors import DomainError
-from continuum_loc.nodes.support.runtime import _spin, PackageNode
+from continuum_loc.nodes.support.managed import PackageNode
+from continuum_loc.nodes.support.runtime import _spin
 from continuum_loc.nodes.support.settings import RecorderNodeSettings
 from continuum_loc.offline.domain import Domain, DOMAINS
 import pytest

@@ -29,6 +29,7 @@ ROS = (
     'std_srvs',
     'diagnostic_msgs',
     'builtin_interfaces',
+    'visualization_msgs',
     'rosgraph_msgs',
     'tf2_msgs',
     'tf2_ros',
@@ -426,3 +427,16 @@ def test_every_command_begins_where_what_it_needs_is_looked_at():
     for name in (*NODES, 'command_line'):
         assert callable(getattr(start, name))
     assert "f'{node} = {NAME}.start:{node}'" in text and 'start:command_line' in text
+
+
+def test_documents_name_files_that_there_are():
+    folders = ('continuum_loc', 'msg_tools', 'studies', 'bench', 'launch', 'config', 'test')
+    kept = {str(path) for folder in folders for path in (ROOT / folder).rglob('*.py')}
+    kept |= {'/setup.py', '/studies/NAME.py'}
+    gone = {
+        f'{page.name}: {name}'
+        for page in [*(ROOT / 'docs').glob('*.md'), ROOT / 'README.md', ROOT / 'CONTRIBUTING.md']
+        for name in re.findall(r'`([\w/]*\w+\.py)\b', page.read_text())
+        if not any(path.endswith(f'/{name}') for path in kept)
+    }
+    assert not gone

@@ -4,6 +4,8 @@ The ray-cast pictures show what geometry says.
 A sphere's disc, its section, and the parts of a robot.
 """
 
+from types import SimpleNamespace
+
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.render import (
     ADDED,
@@ -20,6 +22,7 @@ from continuum_loc.simulator.render import (
 from continuum_loc.simulator.scenes import load_scene
 import numpy as np
 import pytest
+from studies._paper_figures import by_depth, scene_picture
 
 trimesh = pytest.importorskip('trimesh')
 RED = (1.0, 0.0, 0.0)
@@ -94,3 +97,25 @@ def test_changes_to_the_engine_stand_out():
     for anomaly in scene.anomalies:
         near = np.linalg.norm(places - anomaly.centre, axis=1).min() < anomaly.size
         assert near == (anomaly.kind == 'added'), anomaly.name
+
+
+def test_what_was_found_is_red_over_the_map_and_nowhere_else():
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform((-0.5, -0.4, 0.0), (0.5, 0.4, 0.6), (4000, 3))
+    found = SimpleNamespace(points=cloud[cloud[:, 1] > 0.1][:50], confidence=1.0)
+    unsure = SimpleNamespace(points=cloud[cloud[:, 1] > 0.1][50:], confidence=0.0)
+    picture = scene_picture(load_scene('R0'), cloud, cloud, [found, unsure]).astype(int)
+    red = (picture[..., 0] > 90) & (picture[..., 1:].max(axis=2) < 0.3 * picture[..., 0])
+    height, width = (size // 2 for size in red.shape)
+    assert red[height:, width:].sum() > 100
+    red[height:, width:] = False
+    assert not red.any()
+
+
+def test_a_cloud_is_shaded_by_how_far_it_is():
+    camera = Camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0))
+    points = np.column_stack([np.zeros(80), np.linspace(0.0, 3.0, 80), np.zeros(80)])
+    shades = np.array([shape.colour for shape in by_depth(points, camera)])
+    assert (np.diff(shades[:, 1]) < 0.0).all()  # from bright to dark
+    ends = [shape.vertices[:, 1].max() for shape in by_depth(points, camera)]
+    assert (np.diff(ends) > 0.0).all()

@@ -13,13 +13,14 @@ from collections import deque
 from collections.abc import Sequence
 
 from continuum_loc.estimator.base_watch import BaseWatch
-from continuum_loc.estimator.explain import Explanation, explanations, Round, Stretch
+from continuum_loc.estimator.bending import BendWatch
+from continuum_loc.estimator.explain import explanations, Round, Stretch
 from continuum_loc.estimator.factors import Factor, Setup
 from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, share_by_factor
-from continuum_loc.estimator.interpolation import interpolated
 from continuum_loc.estimator.interval import Interval
-from continuum_loc.estimator.readings import gyro_cause, range_cause, strain_cause, travel_cause
+from continuum_loc.estimator.readings import curvature_cause, range_cause, travel_cause
 from continuum_loc.estimator.settings import DoubtSettings
+from continuum_loc.estimator.turning import TurnWatch
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
     BaseSample,
@@ -37,10 +38,9 @@ NEWEST = 5  # intervals that are solved again, and that say whether the window f
 LASTING = 5.0  # [s] that a cause is told without being found again
 BACKOFF_LIMIT = 16.0  # [s] longest time between two rounds without a finding
 ENOUGH = 0.4  # [s] of data before anything is said
-# [s] between two gyros that are judged apart, at first and later, and how often at first
-PATROL, SELDOM, FIRST_PATROLS = 1.0, 20.0, 1
-PATROLLED = 3  # intervals that are solved again for it
+NOISE_SAMPLES = 40  # of a gyro, whose noise tells its unit
 BADLY = 1.5  # times what makes all doubtful: one factor alone may be off by more
+CURVATURES = 8  # newest samples of the strain, whose noise tells its unit
 MOST = 0.7  # of a kind's samples have to fit, whatever else does
 LOW_SHARE = 0.6  # of a sensor's fitting samples: somebody is wrong
 BLIND = 'no usable zone'
@@ -65,8 +65,10 @@ class Doubts:
         self._since: dict[str, float] = {}
         self._round: Round | None = None
         named = {factor.name for factor in factors}
-        self._gyro_names = [imu.name for imu in setup.robot.imu if 'gyro' in named]
-        self._patrolled, self._next_patrol = 0, PATROL
+        self._turns, self._bends = watches(setup, factors)
+        self._comparisons = deque(one for one in (self._turns, self._bends) if one)
+        self._curvature: deque[np.ndarray] = deque(maxlen=CURVATURES)
+        self._noise: dict[str, deque[np.ndarray]] = {}
         self.base = BaseWatch(setup, window)
         self._off = False  # the window does not fit, and no round of explanations has been yet
         self._next_round, self._backoff, self._next_reading = 0.0, 1.0, 0.0
@@ -80,12 +82,17 @@ class Doubts:
             return
         if used and isinstance(measurement, self._consumed):
             self._recent.append(measurement)
+            if isinstance(measurement, StrainSample):
+                self._hear_strain(measurement, time)
             self.base.note(measurement, time)
         self._read_at_once(measurement, time)
 
     def _read_at_once(self, measurement: Measurement, time: float) -> None:
         """Judge what one measurement alone shows to be in another unit."""
         robot = self._setup.robot
+        if isinstance(measurement, ImuSample) and self._turns:
+            kept = self._noise.setdefault(measurement.sensor, deque(maxlen=NOISE_SAMPLES))
+            kept.append(measurement.angular_velocity)
         if isinstance(measurement, TofFrame):
             cause = range_cause(measurement.ranges, robot.tof_model.max_range)
             if cause:
@@ -96,6 +103,17 @@ class Doubts:
             cause = travel_cause(travel, insertion.range)
             if cause and insertion.mode == 'measured' and np.isfinite(travel):
                 self._tell(('insertion',), cause, time)
+
+    def _hear_strain(self, measurement: StrainSample, time: float) -> None:
+        """Keep a sample for its comparison, and judge whether any body bends so."""
+        if self._bends:
+            self._bends.note(time, measurement)
+        self._curvature.append(measurement.kappa)
+        alike = [one for one in self._curvature if one.shape == measurement.kappa.shape]
+        robot = self._setup.robot
+        cause = curvature_cause(np.array(alike), robot.strain.kappa_sigma, robot.radius)
+        if cause:
+            self._tell(('strain',), cause, time)
 
     @property
     def pending(self) -> bool:
@@ -111,56 +129,29 @@ class Doubts:
             self._tell((name,), cause, time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
-            self._read(time, epoch)
+            self._read(time)
+        self._compare(time)
         self._explain(time, epoch)
         self._judge(time)
 
     # -------------------------------------------------------------------- units, axes and signs
 
-    def _read(self, time: float, epoch: int) -> None:
-        """Compare gyros and strain with the body."""
-        robot, settings = self._setup.robot, self._setup.settings
-        for name, (body, read) in self._gyros(epoch, self._window).items():
-            self._tell((name,), self._gyro_cause(body, read), time)
-        if robot.strain is not None and settings.strain.enabled:
-            body, theta, kappa = self._bending(epoch)
-            cause = strain_cause(body, theta, kappa, robot.strain.kappa_sigma)
-            self._tell(('strain',), cause, time)
+    def _read(self, time: float) -> None:
+        """Judge gyros by their noise."""
+        for name, read in self._noise.items():
+            cause = gyro_noise(np.array(read), self._setup.robot.imu_model.gyro_sigma)
+            if cause:
+                self._tell((name,), cause, time)
 
-    def _gyros(self, epoch: int, window: Window) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Angular velocities (K, 3) of the body and as read, in each IMU's frame [rad/s]."""
-        robot, grid = self._setup.robot, self._setup.grid
-        samples = [one for one in self._recent if isinstance(one, ImuSample)]
-        found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        for imu in robot.imu:
-            mine = [one for one in samples if one.sensor == imu.name]
-            if not mine:
-                continue
-            times = np.array([seconds(one.stamp, epoch) for one in mine])
-            node = grid.node_at(robot.sensor_arclength(imu.name))
-            omega = _rates(window, times, node)
-            inside = np.isfinite(omega[:, 0])
-            read = np.array([one.angular_velocity for one in mine])
-            body = omega @ imu.mount.T_ring_sensor[:3, :3]
-            found[imu.name] = body[inside], read[inside]
-        return found
-
-    def _bending(self, epoch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bending (K, 2) of the body [1/m], and theta and kappa (K,) as read, where they were."""
-        s_nodes, window = self._setup.grid.s, self._window
-        body, theta, kappa = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
-        for one in self._recent:
-            if not isinstance(one, StrainSample):
-                continue
-            time = seconds(one.stamp, epoch)
-            if not window.columns[0].time <= time <= window.columns[-1].time:
-                continue
-            strain = window.body(time).strain
-            bending = [np.interp(one.s, s_nodes, strain[:, axis]) for axis in (4, 5)]
-            body.append(np.column_stack(bending))
-            theta.append(one.theta)
-            kappa.append(one.kappa)
-        return np.concatenate(body), np.concatenate(theta), np.concatenate(kappa)
+    def _compare(self, time: float) -> None:
+        """Compare one kind of sensor with a body that knows nothing of it, by turns."""
+        for one in self._comparisons:
+            causes = one.look(self._window)
+            if causes is not None:
+                for name, cause in causes.items():
+                    self._tell((name,), cause, time)
+                self._comparisons.rotate(-1 - self._comparisons.index(one))
+                return
 
     # ------------------------------------------------------------------------ what would explain
 
@@ -168,72 +159,20 @@ class Doubts:
         """Go on with a round of explanations, or begin one where the window does not fit."""
         if self._round is None:
             if time < self._next_round or not self._uneasy(time):
-                self._patrol(time, epoch)
                 return
-            self._round = Round.of(self._stretch(epoch), self._ordered())
+            self._round = Round.of(self._stretch(epoch), self._candidates)
             return
-        done = self._round.step()
-        named = self._unmasked(self._round, time, epoch)
-        if not (done or named):
+        if not self._round.step():
             return
         found, self._round, self._off = self._round.verdict(), None, False
-        self._backoff = 1.0 if found or named else min(2.0 * self._backoff, BACKOFF_LIMIT)
+        self._backoff = 1.0 if found else min(2.0 * self._backoff, BACKOFF_LIMIT)
         self._next_round = time + self._backoff
-        if found is not None and not named:
+        if found is not None:
             self._tell(found.sensors, found.cause, time)
 
-    def _patrol(self, time: float, epoch: int) -> None:
-        """
-        Judge a gyro by a body that knows nothing of it, now and then.
-
-        One with a wrong axis may fit well enough, as its own weight draws the body along.
-        """
-        if time < self._next_patrol or not self._gyro_names:
-            return
-        name = self._gyro_names[self._patrolled % len(self._gyro_names)]
-        self._patrolled += 1
-        rounds = self._patrolled // len(self._gyro_names)
-        self._next_patrol = time + (PATROL if rounds < FIRST_PATROLS else SELDOM)
-        explanation = next(one for one in self._candidates if one.sensors == (name,))
-        outcome = self._stretch(epoch, PATROLLED).solve(explanation, near=True)
-        if outcome is not None:
-            self._judge_gyro(name, outcome.window, time, epoch)
-
-    def _unmasked(self, round_: Round, time: float, epoch: int) -> bool:
-        """Whether the gyro that was just left out turns out to read otherwise than the rest."""
-        if not round_.gains:
-            return False
-        _, explanation, outcome = round_.gains[-1]
-        if explanation.kind != 'gyro' or len(explanation.sensors) > 1:
-            return False
-        return self._judge_gyro(explanation.sensors[0], outcome.window, time, epoch)
-
-    def _judge_gyro(self, name: str, window: Window, time: float, epoch: int) -> bool:
-        found = self._gyros(epoch, window).get(name)
-        cause = self._gyro_cause(*found) if found else ''
-        if cause:
-            self._tell((name,), cause, time)
-        return bool(cause)
-
-    def _gyro_cause(self, body: np.ndarray, read: np.ndarray) -> str:
-        sigma = self._setup.robot.imu_model.gyro_sigma
-        bias = self._setup.settings.gyro.bias_sigma
-        return gyro_cause(body, read, sigma, bias) or gyro_noise(read, sigma)
-
-    def _ordered(self) -> list[Explanation]:
-        """Explanations, first those by a gyro that shares its ring with what does not fit."""
-        robot = self._setup.robot
-        shares = fit_of(self._window.intervals[-NEWEST:]).shares
-        low = {name for name, share in shares.items() if share < LOW_SHARE}
-        rings = {sensor.ring for sensor in robot.sensors if sensor.name in low}
-        if len(rings) > len(robot.rings) / 2:
-            return self._candidates
-        gyros = {imu.name for imu in robot.imu if imu.ring in rings}
-        return sorted(self._candidates, key=lambda one: not set(one.sensors) <= gyros)
-
-    def _stretch(self, epoch: int, newest: int = NEWEST) -> Stretch:
+    def _stretch(self, epoch: int) -> Stretch:
         believed = [one for one in self._recent if _source(one) not in self.causes]
-        return Stretch(self._setup, self._window, epoch, believed, newest)
+        return Stretch(self._setup, self._window, epoch, believed, NEWEST)
 
     def _uneasy(self, time: float) -> bool:
         """Whether the window has not fitted for some time, whoever is to blame."""
@@ -256,7 +195,7 @@ class Doubts:
     @staticmethod
     def _misfit(intervals: Sequence[Interval]) -> float:
         """Mean squared residual; of gyros only the knots know how much is rattle."""
-        return consistency(intervals, without='gyro')
+        return consistency(intervals, without=('gyro',))
 
     # ---------------------------------------------------------------------- whether to believe it
 
@@ -324,20 +263,20 @@ class Doubts:
                 self.causes.pop(name, None)
 
 
+def watches(setup: Setup, factors: Sequence[Factor]) -> tuple[TurnWatch | None, BendWatch | None]:
+    """Make what compares gyros and strain, where enough else tells of the body."""
+    robot, by_name = setup.robot, {factor.name: factor for factor in factors}
+    told_by = {'tof': robot.tof, 'tracker': robot.trackers, 'field': robot.hall}
+    absolute = any(name in by_name and sensors for name, sensors in told_by.items())
+    strain = 'strain' in by_name and robot.strain is not None
+    gyros = 'gyro' in by_name and bool(robot.imu) and (absolute or strain)
+    return (
+        TurnWatch(setup, by_name['gyro']) if gyros else None,
+        BendWatch(setup, by_name['strain']) if strain and absolute else None,
+    )
+
+
 def _source(measurement: Measurement) -> str:
     """Name under which a measurement's sensor is accused."""
     kinds = {StrainSample: 'strain', EncoderSample: 'insertion', BaseSample: 'base'}
     return kinds.get(type(measurement)) or getattr(measurement, 'sensor', '')
-
-
-def _rates(window: Window, times: np.ndarray, node: int) -> np.ndarray:
-    """Angular velocity (K, 3) of a node at increasing times (K,), nan outside the window."""
-    found = np.full((len(times), 3), np.nan)
-    knots = np.array([column.time for column in window.columns])
-    which = np.searchsorted(knots, times) - 1
-    for k in np.unique(which[(which >= 0) & (which < len(window.intervals))]):
-        at = np.flatnonzero(which == k)
-        a, b = window.column(k), window.column(k + 1)
-        nodes = np.full(len(at), node)
-        found[at] = interpolated(a, b, times[at] - a.time, nodes).v[:, 3:]
-    return found

@@ -17,11 +17,10 @@ from typing import NamedTuple
 from continuum_loc.errors import MeasurementError, SingularError
 from continuum_loc.estimator.factors import FACTORS, Setup
 from continuum_loc.estimator.priors import Priors
-from continuum_loc.estimator.solver import from_a_guess, track
+from continuum_loc.estimator.solver import from_a_guess
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
     EncoderSample,
-    ImuSample,
     Measurement,
     seconds,
     StrainSample,
@@ -96,12 +95,8 @@ class Stretch:
             one for one in measurements if first < seconds(one.stamp, epoch) <= last
         ]
 
-    def solve(self, explanation: Explanation, near: bool = False) -> Outcome | None:
-        """
-        Solve with one thing otherwise; None where nothing is left, or no solution.
-
-        near: from next to the minimum, which takes a third of the time.
-        """
+    def solve(self, explanation: Explanation) -> Outcome | None:
+        """Solve with one thing otherwise; None where nothing is left, or no solution."""
         setup, columns = self._setup, self._columns
         robot = base_freed(setup.robot) if explanation.base_freed else setup.robot
         priors = Priors(robot, setup.grid, setup.settings)
@@ -116,7 +111,7 @@ class Stretch:
             return None
         window.set_columns(columns[: len(window.columns)])
         try:
-            track(window) if near else from_a_guess(window, factors)
+            from_a_guess(window, factors)
         except SingularError:
             return None
         costs: dict[str, float] = {}
@@ -164,11 +159,6 @@ def explanations(robot: RobotDescription, used: set[str]) -> list[Explanation]:
             ('base',), 'is not where the description has it', AS_IS.change, base_freed=True
         )
     )
-    if 'gyro' in used and robot.imu:
-        found += [
-            _without(ImuSample, imu.name, 'contradicts the rest', 'gyro') for imu in robot.imu
-        ]
-        found.append(_without_all_gyros(robot))
     if 'strain' in used and robot.strain is not None:
         found.append(_without(StrainSample, 'strain', 'contradicts the rest', 'strain'))
     if 'tracker' in used and len(robot.trackers) > 1:
@@ -185,14 +175,6 @@ def _without(kind: type, name: str, cause: str, factor: str) -> Explanation:
         return None if mine else measurement
 
     return Explanation((name,), cause, change, factor)
-
-
-def _without_all_gyros(robot: RobotDescription) -> Explanation:
-    def change(measurement: Measurement) -> Measurement | None:
-        return None if isinstance(measurement, ImuSample) else measurement
-
-    names = tuple(imu.name for imu in robot.imu)
-    return Explanation(names, 'contradict the rest', change, 'gyro')
 
 
 def _of_tof(robot: RobotDescription) -> list[Explanation]:

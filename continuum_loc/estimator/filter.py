@@ -31,6 +31,7 @@ from continuum_loc.estimator.recovery import Recovery
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.solver import track
+from continuum_loc.estimator.start import Start
 from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import Measurement, nanoseconds, seconds
@@ -86,6 +87,7 @@ class SlidingWindowFilter:
         )
         self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
         self._calibrator = self._new_calibrator()
+        self.start = Start(self.setup, self.window, self.factors)
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle = Cycle(self.factors, self.settings.output_rate)
 
@@ -171,6 +173,7 @@ class SlidingWindowFilter:
             self._rest.note(measurement)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
         self.doubts.note(measurement, time, any(used))
+        self.start.note(measurement)
         return any(used)
 
     def _consumers(self, kind: type) -> list[Factor]:
@@ -210,9 +213,21 @@ class SlidingWindowFilter:
         with self._threads.limit(limits=1, user_api='blas'):
             # Small matrices: more threads only wait for one another.
             time = seconds(output, self.epoch)
-            estimate = self._estimate(time, self._solve(time), started)
+            if self.start.pending and not self.recovery.acquired:
+                return self._locate(time)
+            outcome = self._solve(time)
+            told = not self.start.pending
+            self.start.watch(time, self.recovery.worst_share())
+            if told and self.start.pending:
+                self.recovery.lose()  # this last estimate says so
+            estimate = self._estimate(time, outcome, started) if told else None
             self._calibrate(time)
             return estimate
+
+    def _locate(self, time: float) -> None:
+        """Look for the base, and tell nothing."""
+        if self.start.due(time):
+            self.start.tried(time, *self.recovery.locate(self.start.bodies()))
 
     def _solve(self, time: float) -> tuple[int, bool]:
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
@@ -312,7 +327,7 @@ class SlidingWindowFilter:
 
     def _status(self) -> Status:
         """Say what to tell of the body; nothing but an undisputed fit is tracking."""
-        status = self.recovery.status
+        status = 'lost' if self.start.astray else self.recovery.status
         return 'doubtful' if status == 'tracking' and self.doubts.reasons else status
 
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:
@@ -344,6 +359,7 @@ class SlidingWindowFilter:
         if self._calibrator is not None:
             covariance[:, :6, :6] += self._calibrator.spread(rings)
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
+        T_map_frame, frame_covariance = self.window.frame(time)
         return Estimate(
             stamp=self.epoch + nanoseconds(time),
             T_map_ring=body.T[rings],
@@ -362,4 +378,6 @@ class SlidingWindowFilter:
             converged=outcome[1],
             step_seconds=clock.perf_counter() - started,
             lagged=lagged,
+            T_map_frame=T_map_frame,
+            frame_covariance=frame_covariance,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from continuum_loc.estimator.factors import Factor
@@ -52,12 +52,12 @@ def share_by_factor(intervals: Sequence[Interval]) -> dict[str, float]:
     return {name: float(fit / usable) for name, (usable, fit) in sums.items() if usable}
 
 
-def consistency(intervals: Sequence[Interval], without: str = '') -> float:
-    """Mean squared normalised residual of all factors but one; 1 where the noise is as stated."""
+def consistency(intervals: Sequence[Interval], without: Collection[str] = ()) -> float:
+    """Mean squared normalised residual of all factors but some; 1 where the noise is as stated."""
     squared, count = 0.0, 0
     for interval in intervals:
         for factor, report in interval.reports.items():
-            if factor.name != without:
+            if factor.name not in without:
                 squared += report.squared
                 count += report.count
     return squared / max(count, 1)

@@ -60,6 +60,20 @@ class Interval:
             self.cost += report.cost
         self.changed = False
 
+    def batch(self, factor: Factor) -> tuple | None:
+        """Arrays of one factor's rows, where they were linearised."""
+        return self._batches.get(factor)
+
+    def share_of(self, factor: Factor, a: Column, b: Column, sensor: str = '') -> Normal:
+        """Give what a factor, or one of its sensors, adds to the equations at columns a and b."""
+        share, weights = Normal.zeros(len(self.normal.g)), factor.weights
+        if factor in self._batches:
+            if sensor:
+                factor.weights = weights * [name == sensor for name in factor.sensors]
+            factor.linearise(self._batches[factor], a, b, share)
+            factor.weights = weights
+        return share
+
     def clock_scores(self, factor: Factor, a: Column, b: Column) -> ClockScores | None:
         """How the factor's measurements here would change with their sensors' clocks."""
         if factor in self._batches and factor not in self._scores:

@@ -98,7 +98,7 @@ class Parameters:
         ]
 
     def columns(self, kind: str, names: Sequence[str]) -> np.ndarray:
-        """(len(names), n) places in theta of the n constants of a kind; -1 where there are none."""
+        """(len(names), n) places in theta of the n constants of a kind; -1 where there is none."""
         out = np.full((len(names), len(PARTS[kind])), -1, np.int64)
         for row, name in enumerate(names):
             at = self._places.get((kind, self.boards.get(name, name) if kind == 'clock' else name))

@@ -15,32 +15,9 @@ import numpy as np
 DEGREES = 180.0 / np.pi
 TRAVEL_SLACK = 0.02  # [m] that an encoder may read beyond the described range
 LENGTHS = {'millimetres': 1e-3, 'centimetres': 1e-2}
+TOO_NOISY = 100.0  # times the noise described: no motion is that fast
+TOO_CURVED = 'curvature 1000 times too large?'
 BEYOND = 10.0  # times its reach: no sensor is that far off
-BETTER = 4.0  # times: how much smaller the squares have to be with a cause than without
-MISFIT = 4.0  # squared error of a reading over its noise's from which a cause is looked for
-EXPLAINED = 0.7  # share of what is read that a cause has to account for
-EXCITED = 9.0  # squared motion over the noise's, below which nothing can be told
-
-
-def gyro_cause(body: np.ndarray, read: np.ndarray, sigma: float, bias: float) -> str:
-    """
-    Say what is wrong with a gyro, or ''.
-
-    body, read: (K, 3) angular velocities of the body and of the sensor, in the sensor's frame
-    [rad/s]. sigma: of a sample; bias: the largest that is likely [rad/s].
-    """
-    count = read.size
-    if len(read) < 10 or np.sum(body**2) < EXCITED * sigma**2 * count:
-        return ''
-    as_read = _squares(body - read, sigma, bias)
-    if as_read < MISFIT * count:
-        return ''
-    left = {
-        cause: _squares(body - read @ M.T, sigma, bias)
-        for cause, M in GYRO_CAUSES
-        if _explained(read, body @ np.linalg.inv(M).T) > EXPLAINED
-    }
-    return _clear(left, as_read, count)
 
 
 def travel_cause(travel: float, limits: tuple[float, float]) -> str:
@@ -63,53 +40,29 @@ def range_cause(ranges: np.ndarray, max_range: float) -> str:
     return f'reads {np.median(read):.4g} m where {max_range:g} m is its reach: millimetres?'
 
 
-def strain_cause(body: np.ndarray, theta: np.ndarray, kappa: np.ndarray, sigma: float) -> str:
+def curvature_cause(kappa: np.ndarray, sigma: float, radius: float) -> str:
     """
-    Say what is wrong with a strain sensor, or ''.
+    Say that a strain sensor reads what no body does, or ''.
 
-    body: (K, 2) bending of the body [1/m]; theta, kappa: (K,) as read; sigma: of a reading [1/m].
+    kappa: (K, M) newest samples at M stations [1/m]; sigma: of a reading [1/m]; radius: of the
+    body [m], which cannot bend about a point within itself. Noise far above the one described
+    tells the unit while the body is straight.
     """
-    if len(kappa) < 10 or np.sum(body**2) < EXCITED * sigma**2 * body.size:
+    if np.median(np.abs(kappa[-1])) * radius > 1.0:
+        return TOO_CURVED
+    if len(kappa) < 4:
         return ''
-    as_read = _squares(body - _bending(theta, kappa), sigma, 0.0)
-    if as_read < MISFIT * body.size:
-        return ''
-    left = {
-        cause: _squares(body - _bending(*change(theta, kappa)), sigma, 0.0)
-        for cause, change in STRAIN_CAUSES.items()
-    }
-    return _clear(left, as_read, body.size)
+    noise = np.median(np.std(np.diff(kappa, axis=0), axis=0)) / 2**0.5
+    return TOO_CURVED if noise > TOO_NOISY * sigma else ''
 
 
-def _clear(left: dict[str, float], as_read: float, count: int) -> str:
-    """Choose the likeliest cause, where it explains nearly all; of equal ones the first."""
-    least = min(left.values(), default=np.inf)
-    if BETTER * least > as_read:
-        return ''
-    return next(cause for cause, squares in left.items() if squares <= 1.2 * least + count)
-
-
-def _explained(read: np.ndarray, meant: np.ndarray) -> float:
-    """
-    Share of the readings' squares that what would have been read explains.
-
-    A sensor that rattles reads much of which the body knows nothing.
-    """
-    return 1.0 - float(np.sum((read - meant) ** 2) / max(np.sum(read**2), 1e-30))
-
-
-def _squares(error: np.ndarray, sigma: float, bias: float) -> float:
-    """Sum of squares over the noise's, without a constant up to `bias`."""
-    constant = np.clip(np.mean(error, axis=0), -bias, bias)
-    return float(np.sum((error - constant) ** 2)) / sigma**2
-
-
-def _bending(theta: np.ndarray, kappa: np.ndarray) -> np.ndarray:
+def bending_read(theta: np.ndarray, kappa: np.ndarray) -> np.ndarray:
+    """Return the bending (K, 2) of angles and curvatures (K,)."""
     return np.column_stack([-kappa * np.sin(theta), kappa * np.cos(theta)])
 
 
-def _signed_axes() -> list[tuple[str, np.ndarray]]:
-    """All ways but one to exchange axes and signs, those that change least first."""
+def _signed_axes() -> list[tuple[str, np.ndarray, int]]:
+    """All ways but one to exchange axes and signs, and how many changes each is, fewest first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         moved = sum(place != axis for place, axis in enumerate(order))
@@ -117,7 +70,7 @@ def _signed_axes() -> list[tuple[str, np.ndarray]]:
         if moved or flipped:
             M = np.diag(signs) @ np.eye(3)[list(order)]
             found.append((moved + len(flipped), _named(M, moved, flipped), M))
-    return [(cause, M) for _, cause, M in sorted(found, key=lambda one: one[0])]
+    return [(cause, M, changes) for changes, cause, M in sorted(found, key=lambda one: one[0])]
 
 
 def _named(M: np.ndarray, moved: int, flipped: list[str]) -> str:
@@ -132,14 +85,14 @@ def _named(M: np.ndarray, moved: int, flipped: list[str]) -> str:
 
 
 GYRO_CAUSES = [
-    ('turns 57 times too fast: degrees per second?', np.eye(3) / DEGREES),
-    ('turns 57 times too slowly: converted to radians twice?', np.eye(3) * DEGREES),
+    ('turns 57 times too fast: degrees per second?', np.eye(3) / DEGREES, 1),
+    ('turns 57 times too slowly: converted to radians twice?', np.eye(3) * DEGREES, 1),
     *_signed_axes(),
 ]
 STRAIN_CAUSES = {
     'curvature 1000 times too small: 1/mm?': lambda theta, kappa: (theta, 1e3 * kappa),
     'curvature 100 times too small: 1/cm?': lambda theta, kappa: (theta, 1e2 * kappa),
-    'curvature 1000 times too large?': lambda theta, kappa: (theta, 1e-3 * kappa),
+    TOO_CURVED: lambda theta, kappa: (theta, 1e-3 * kappa),
     'angle in degrees?': lambda theta, kappa: (theta / DEGREES, kappa),
     'angle converted to radians twice?': lambda theta, kappa: (theta * DEGREES, kappa),
     'angle of the other sign?': lambda theta, kappa: (-theta, kappa),

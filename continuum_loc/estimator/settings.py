@@ -185,6 +185,24 @@ class FieldSettings(Settings):
     )
 
 
+class MechanicsSettings(Settings):
+    """The shape that statics expects of the tendons, where the description has `actuation`."""
+
+    enabled: bool = True
+    scale: float = Field(1.0, gt=0.0, description="factor on the block's `strain_sigma`")
+    memory: float = Field(
+        0.3, gt=0.0, description='time over which all samples count as one observation [s]'
+    )
+    period: float = Field(
+        0.05, ge=0.0, description='least time between two samples that are used [s]'
+    )
+    cauchy: float = Field(
+        1.0,
+        gt=0.0,
+        description='scale of the Cauchy loss in sigmas: what touches something counts little',
+    )
+
+
 class SolverSettings(Settings):
     """Gauss-Newton with damping."""
 
@@ -352,6 +370,7 @@ class EstimatorSettings(Settings):
     base: BaseSettings = BaseSettings()
     gravity: GravitySettings = GravitySettings()
     field: FieldSettings = FieldSettings()
+    mechanics: MechanicsSettings = MechanicsSettings()
     solver: SolverSettings = SolverSettings()
     recovery: RecoverySettings = RecoverySettings()
     health: HealthSettings = HealthSettings()

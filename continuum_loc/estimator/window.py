@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 
+from continuum_loc import lie
 from continuum_loc.estimator.chain import Chain
 from continuum_loc.estimator.interpolation import (
     Body,
@@ -179,6 +180,18 @@ class Window:
         """All nodes at `time` in the window."""
         k = self.knot_before(time)
         return body_between(self.column(k), self.column(k + 1), time)
+
+    def frame(self, time: float) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Pose (4, 4) and covariance (6, 6) of a measured base's frame at `time` in the window."""
+        if not self.grid.frames:
+            return None, None
+        k = self.knot_before(time)
+        a, b = self.column(k), self.column(k + 1)
+        u = (time - a.time) / (b.time - a.time)
+        J = np.zeros((6, self.grid.dim))
+        J[:, self.grid.frame_rows] = np.eye(6)
+        T_map_frame = lie.interpolate(a.T_map_frame[0], b.T_map_frame[0], np.array(u))
+        return T_map_frame, self.chain.covariance(k, (1.0 - u) * J, u * J)
 
     def motion_covariance(self, time: float, nodes: np.ndarray) -> np.ndarray:
         """Covariance (m, 12, 12) of [pose, velocity] of `nodes` (m,) at `time` in the window."""

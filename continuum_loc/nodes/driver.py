@@ -19,8 +19,9 @@ from typing import Any
 from continuum_loc.errors import MessageError, SettingsError
 from continuum_loc.intake import Intake
 from continuum_loc.measurements import ImuSample, StrainSample, TofFrame
+from continuum_loc.nodes.support.managed import PackageNode
 from continuum_loc.nodes.support.readings import lines, Readings
-from continuum_loc.nodes.support.runtime import PackageNode, run
+from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import DriverNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
@@ -39,18 +40,29 @@ class DriverNode(PackageNode):
         self.published: Counter[str] = Counter()
         self.intake = Intake(robot, report=self._tell)
         self.readings = Readings(robot, self.settings, self.now)
-        self.outputs = {topic: self.publisher(topic) for topic in TOPIC_OF.values()}
+        self.outputs: dict[str, Any] = {}
         self._stop = threading.Event()
+
+    def configure(self) -> None:
+        """Make the outputs."""
+        self.outputs = {topic: self.publisher(topic) for topic in TOPIC_OF.values()}
+
+    def activate(self) -> None:
+        """Open the source, and read it."""
         self._source = _opened(self.settings.source)
-        self._thread = self.thread(self._read, 'reader')
-        self._thread.start()
+        self._stop.clear()
+        reader = self.thread(self._read, 'reader')
+        reader.start()
+        self.undo(self._stop_reading, reader)
         self.get_logger().info(f'reading {self.settings.source}')
 
-    def close(self) -> None:
-        """Stop reading, and say what came of it."""
+    def _stop_reading(self, reader: threading.Thread) -> None:
         self._stop.set()
-        self._thread.join(timeout=5.0)
+        reader.join(timeout=5.0)
         os.close(self._source)
+
+    def close(self) -> None:
+        """Say what came of it."""
         counts = {'published': dict(self.published), 'refused': dict(self.intake.refused)}
         print(f'driver: {json.dumps(counts)}', file=sys.stderr)
 
@@ -64,7 +76,8 @@ class DriverNode(PackageNode):
             else:
                 self.outputs[topic].publish(message)
                 self.published[topic] += 1
-        self.finish()
+        if not self._stop.is_set():
+            self.finish()
 
     def _tell(self, kind: str, text: str) -> None:
         self.get_logger().warning(f"{text} [further cases of '{kind}' are only counted]")

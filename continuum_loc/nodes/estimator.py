@@ -5,28 +5,45 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 import sys
+import time
 from typing import Any
 
-from continuum_loc.errors import MessageError
+from continuum_loc.errors import FrameError, MessageError
 from continuum_loc.estimate import Estimate
 from continuum_loc.estimator import EstimatorSettings, settings_of, SlidingWindowFilter
 from continuum_loc.estimator.settings import PRESETS_FOLDER
-from continuum_loc.measurements import EncoderSample, Measurement, nanoseconds, TofFrame
+from continuum_loc.mapping.prior_map import PriorMap
+from continuum_loc.measurements import (
+    BaseSample,
+    EncoderSample,
+    Measurement,
+    nanoseconds,
+    TofFrame,
+)
 from continuum_loc.nodes.support import parameters
+from continuum_loc.nodes.support.body import body_message, ring_records, ring_topics
+from continuum_loc.nodes.support.frames import FrameTree
 from continuum_loc.nodes.support.memory import RecentPoses, SeenScene
 from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import EstimatorNodeSettings
-from continuum_loc.nodes.support.transforms import broadcaster
+from continuum_loc.nodes.support.transforms import (
+    available,
+    Broadcaster,
+    Frames,
+    listen_to_frames,
+)
 from continuum_loc.nodes.support.warm_up import warm_up
 from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import tracked_pose
 from msg_tools.factory import ros_messages
-from msg_tools.records import CloudRecord
+from msg_tools.geometry import MAP
+from msg_tools.records import CloudRecord, PosesRecord
 from msg_tools.results import columns_message, map_record, tip_message
 from msg_tools.topics import INPUTS, tip_of, TRACKER
 import numpy as np
+from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
@@ -41,25 +58,58 @@ class EstimatorNode(WorkerNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', EstimatorNodeSettings(), **options)
-        self.filter_settings = parameters.declare(self, self._preset(), FILTER)
+        self.filter_settings = parameters.declare(self, self._preset(), FILTER, live=True)
         self.check_parameters()
-        self.prior_map = self._load_map()
-        self.get_logger().info('compiling, or loading what an earlier run compiled')
-        self.filter = self._new_filter(self.robot)
+        self.prior_map: PriorMap | None = None
+        self.filter: SlidingWindowFilter | None = None
         self.estimate: Estimate | None = None
         self.recent = RecentPoses(self.settings.trajectory_seconds)
-        self.scene = SeenScene(self.robot, self.prior_map, self.settings.reconstruction_seconds)
+        self.scene: SeenScene | None = None
+        self.frames = Frames.of(self.robot, self.settings)
+        self.tree = FrameTree()
+        self.tf: Broadcaster | None = None
+        self.body: Any = None
         self._insertion = 0.0
         self._scene_published = 0
+        self._told_base = 0  # stamp of the newest pose of the base that was taken from /tf
+        self._hypotheses: Any = None
+
+    # ------------------------------------------------ life
+
+    def prepare(self) -> None:
+        """Load the map, compile the filter, offer services and outputs."""
+        self.prior_map = self._load_map()
+        self.scene = SeenScene(self.robot, self.prior_map, self.settings.reconstruction_seconds)
+        self.filter = self._new_filter(self.robot)
+        self.estimate = None
         self._warm_up()
         self._offer_services()
-        self.frames = broadcaster(self, self.robot, self.settings.frame_prefix)
-        if self.frames is None:
-            self.get_logger().info('no TF: tf2_msgs is not installed')
-        for topic in ('poses', 'backbone', 'tip', 'reconstruction'):
+        if available():
+            self.tf = Broadcaster(self, self.frames, self.tree)
+        elif self.frames.tf != 'none':
+            self.get_logger().warning(
+                'no TF: tf2_msgs is not installed (apt install ros-jazzy-tf2-msgs)'
+            )
+        topics = ('poses', 'backbone', 'tip', 'reconstruction', *ring_topics(self.robot))
+        base = self.robot.base
+        if base.mode == 'measured':
+            topics += ('base/frame', *(['base/pose'] if self.settings.base_tf else []))
+        if base.mode == 'free' and base.region[0] > 0.0:
+            topics += ('base/hypotheses',)
+        for topic in topics:
             self.publisher(topic)
+        markers = ros_messages().resolve('visualization_msgs/msg/MarkerArray')
+        self.body = self.managed_publisher(markers, 'body', QoSProfile(depth=5))
+
+    def activate(self) -> None:
+        """Show the map and the fixed frames, and hear the sensors."""
         self._publish_map()
-        self.begin()
+        if self.tf is not None:
+            self.tf.send_fixed()
+            listen_to_frames(self, self.tree)
+        super().activate()
+        if self.settings.base_tf:
+            self.every(1.0 / self.robot.base.measurement.rate, self._tell_base)
 
     # ------------------------------------------------ the filter (worker thread)
 
@@ -70,10 +120,32 @@ class EstimatorNode(WorkerNode):
         if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
             self._insertion = float(measurement.position[measurement.names.index('insertion')])
         estimate = self.filter.process(measurement)
+        self._publish_hypotheses(measurement.stamp)
         if estimate is None:
             return None
         self._publish(estimate)
         return estimate.stamp
+
+    def _tell_base(self) -> None:
+        """Put what /tf newly says of the base onto `base/pose`, where it is heard and recorded."""
+        frame, carrier = self.robot.base.measurement.frame, self.settings.base_tf
+        stamp = self.tree.latest(frame, carrier)
+        if stamp is None or stamp <= self._told_base:
+            return
+        try:
+            T_frame_base = self.tree.transform(frame, carrier, stamp)
+        except FrameError as error:
+            self.get_logger().warning(f'base_tf: {error}', throttle_duration_sec=10.0)
+            return
+        self._told_base = stamp
+        self.publish('base/pose', BaseSample(stamp, frame, T_frame_base))
+
+    def _publish_hypotheses(self, stamp: int) -> None:
+        """Publish where the base may be, whenever a search has found other places."""
+        found = self.filter.start.hypotheses
+        if found is not self._hypotheses and len(found):
+            self.publish('base/hypotheses', PosesRecord(stamp, found))
+        self._hypotheses = found
 
     def idle(self) -> bool:
         """Place what the ToF sensors saw an instant ago, and publish it when it is due."""
@@ -95,7 +167,9 @@ class EstimatorNode(WorkerNode):
         """Lost and doubtful are errors; starting, suspects, what nothing observes are warnings."""
         estimate = self.estimate
         if estimate is None:
-            return WARN, 'no estimate yet', {}
+            places = len(self.filter.start.hypotheses) if self.filter is not None else 0
+            looked = f': {places} places fit, move on' if places > 1 else ''
+            return WARN, f'no estimate yet{looked}', {}
         inliers = (
             float(np.mean(list(estimate.inliers.values()))) if estimate.inliers else float('nan')
         )
@@ -120,24 +194,49 @@ class EstimatorNode(WorkerNode):
 
     def summary(self) -> dict[str, Any]:
         """Add the filter's own counts."""
-        return super().summary() | {'filter': self.filter.counts}
+        return super().summary() | {'filter': self.filter.counts if self.filter else {}}
 
     # ------------------------------------------------ outputs
+
+    def publish_message(self, topic: str, message: Any) -> None:
+        """Publish a message, its frame named as the user has it."""
+        if message.header.frame_id == MAP:
+            message.header.frame_id = self.frames.map
+        super().publish_message(topic, message)
+
+    def deserialized(self, data: bytes, type_name: str) -> Any:
+        """Return the message, the map's frame in it named as everywhere in here."""
+        message = super().deserialized(data, type_name)
+        header = getattr(message, 'header', None)
+        if header is not None and header.frame_id.lstrip('/') == self.frames.map:
+            header.frame_id = MAP
+        return message
 
     def _publish(self, estimate: Estimate) -> None:
         before, self.estimate = self.estimate, estimate
         if estimate.doubts and (before is None or not before.doubts):
             self.get_logger().warning(f'doubtful: {"; ".join(estimate.doubts)}')
         self.publish('poses', estimate)
-        child = self.settings.frame_prefix + self.robot.ring_names[-1]
-        self.publish_message('tip', tip_message(ros_messages(), tip_of(estimate), child))
+        self._publish_for_those_who_listen(estimate)
+        tip = tip_message(ros_messages(), tip_of(estimate), self.frames.rings[-1])
+        self.publish_message('tip', tip)
         self.publish('backbone', estimate)
-        if self.frames is not None and self.settings.publish_tf:
-            self.frames.send(estimate.stamp, estimate.T_map_ring)
+        if estimate.T_map_frame is not None:
+            self.publish('base/frame', estimate)
+        if self.tf is not None:
+            self.tf.send(estimate.stamp, estimate.T_map_ring, estimate.T_map_frame)
         self.recent.add(estimate)
         smoothed = estimate.lagged if self.filter_settings.lag > 0.0 else estimate
         if smoothed is not None:
             self.scene.follow(smoothed)
+
+    def _publish_for_those_who_listen(self, estimate: Estimate) -> None:
+        """Publish what costs something to write: each ring by itself, and the body to look at."""
+        for topic, item in ring_records(self.frames, estimate):
+            if self.publisher(topic).get_subscription_count():
+                self.publish(topic, item)
+        if self.body is not None and self.body.get_subscription_count():
+            self.body.publish(body_message(ros_messages(), self.frames, estimate))
 
     def _publish_map(self) -> None:
         if self.prior_map is None:
@@ -160,8 +259,13 @@ class EstimatorNode(WorkerNode):
             ('save_map', self._save_map),
             ('save_trajectory', self._save_trajectory),
         ):
-            self.create_service(Trigger, f'~/{name}', partial(_answer, action))
-        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self._initial_pose, 10)
+            self.serve(Trigger, f'~/{name}', partial(_answer, action))
+        self.listen(
+            'geometry_msgs/msg/PoseWithCovarianceStamped',
+            'initialpose',
+            self._initial_pose,
+            QoSProfile(depth=10),
+        )
 
     def _reset(self) -> str:
         self.in_worker(lambda: self._rebuild(self.robot))
@@ -204,10 +308,12 @@ class EstimatorNode(WorkerNode):
             self.filter_settings = parameters.read(
                 self, type(self.filter_settings), FILTER, changed=mine
             )
-            self.in_worker(lambda: self._rebuild(self.robot))
+            if self.filter is not None:
+                self.in_worker(lambda: self._rebuild(self.robot))
         rest = {name: value for name, value in values.items() if name not in mine}
         reason = super()._change(rest) if rest else None
-        self.scene.duration = self.settings.reconstruction_seconds
+        if self.scene is not None:
+            self.scene.duration = self.settings.reconstruction_seconds
         return reason
 
     def _rebuild(self, robot: RobotDescription) -> None:
@@ -245,7 +351,10 @@ class EstimatorNode(WorkerNode):
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:
+            self.get_logger().info('compiling, or loading what an earlier run compiled')
+            begin = time.monotonic()
             warm_up(self.robot, self.prior_map, self.filter_settings, self.scene)
+            self.get_logger().info(f'compiled or loaded in {time.monotonic() - begin:.1f} s')
 
 
 def with_base(

@@ -16,13 +16,15 @@ import time
 from typing import Any
 
 from continuum_loc.errors import SettingsError
-from continuum_loc.nodes.support.runtime import input_qos, PackageNode, run, write_summary
+from continuum_loc.nodes.support.managed import PackageNode
+from continuum_loc.nodes.support.quality import input_qos
+from continuum_loc.nodes.support.runtime import run, write_summary
 from continuum_loc.nodes.support.settings import RecorderNodeSettings
 from msg_tools.bag import BagWriter, split_topic
-from msg_tools.topics import topic_spec, TOPICS, TRACKER
+from msg_tools.topics import FAMILIES, key_of, topic_spec, TOPICS
 from rclpy.qos import DurabilityPolicy
 
-# [s] trackers are found on the graph, as only the robot description could name them before.
+# [s] trackers and rings are found on the graph: only the robot description names them before.
 WATCH_PERIOD = 0.5
 POLL = 0.1
 MOST_TOPICS = 256
@@ -40,26 +42,32 @@ class RecorderNode(PackageNode):
         super().__init__('recorder', RecorderNodeSettings(), **options)
         self.check_parameters()
         self.topics = self._wanted()
-        path = self.settings.bag or f'bag_{datetime.now():%Y%m%d_%H%M%S}'
-        self.bag = BagWriter(path, self.get_namespace())
         self.dropped: Counter[str] = Counter()
         self._queue: Queue[tuple[str, bytes, int]] = Queue(self.settings.queue_messages)
         self._bytes_in = self._bytes_out = 0  # each counted by one thread
         self._stop = threading.Event()
-        self._thread = self.thread(self._write, 'writer')
-        self._thread.start()
         self._subscribed: set[str] = set()
+
+    def activate(self) -> None:
+        """Open a new bag, and hear what goes into it."""
+        path = self.settings.bag or f'bag_{datetime.now():%Y%m%d_%H%M%S}'
+        self.bag = BagWriter(path, self.get_namespace())
+        self._stop.clear()
+        writer = self.thread(self._write, 'writer')
+        writer.start()
+        self.undo(self._finish_bag, writer)
+        self._subscribed.clear()
         for topic in self.topics:
-            if topic != TRACKER:
+            if topic not in FAMILIES:
                 self._subscribe(topic)
-        if TRACKER in self.topics:
-            self.create_timer(WATCH_PERIOD, self._find_trackers)
+        if FAMILIES.keys() & set(self.topics):
+            self.every(WATCH_PERIOD, self._find_families)
         self.get_logger().info(f'recording {len(self._subscribed)} topics into {path}')
 
-    def close(self) -> None:
+    def _finish_bag(self, writer: threading.Thread) -> None:
         """Write what is queued, and the bag's index; say what it holds."""
         self._stop.set()
-        self._thread.join(timeout=60.0)
+        writer.join(timeout=60.0)
         try:
             self.bag.close()
         finally:
@@ -95,13 +103,13 @@ class RecorderNode(PackageNode):
         self.listen(spec.type, topic, partial(self._receive, topic), qos, raw=True)
         self._subscribed.add(topic)
 
-    def _find_trackers(self) -> None:
+    def _find_families(self) -> None:
         for name, types in self.get_topic_names_and_types():
             split = split_topic(name, types[0])
             if (
                 split is None
                 or split[0] != self.get_namespace().strip('/')
-                or not split[1].startswith(TRACKER)
+                or key_of(split[1]) not in FAMILIES.keys() & set(self.topics)
             ):
                 continue
             if split[1] not in self._subscribed and len(self._subscribed) < MOST_TOPICS:

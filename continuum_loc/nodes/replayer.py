@@ -16,13 +16,15 @@ from typing import Any
 from continuum_loc.errors import BagError, SettingsError
 from continuum_loc.measurements import nanoseconds
 from continuum_loc.nodes.support.delivery import await_acknowledged, await_listeners
+from continuum_loc.nodes.support.managed import PackageNode
 from continuum_loc.nodes.support.pacing import Paced
-from continuum_loc.nodes.support.runtime import PackageNode, run
+from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import ReplayerNodeSettings
 from msg_tools.bag import contract_topics, open_bag, raw_messages
 from msg_tools.factory import ros_messages
 from msg_tools.geometry import time_message
 from msg_tools.topics import INPUTS, TOPICS, TRACKER
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 LOOKAHEAD = 0.5  # s
@@ -38,21 +40,29 @@ class ReplayerNode(PackageNode):
         self.check_parameters()
         self.path = Path(self.settings.bag)
         self.published: Counter[str] = Counter()
-        self.outputs = {topic: self.publisher(topic) for topic in self._topics()}
-        self._clock_output = (
-            self.create_publisher(Clock, CLOCK, 10) if self.settings.clock else None
-        )
+        self.outputs: dict[str, Any] = {}
+        self._clock_output: Any = None
         self._paced: Paced | None = None
         self._stop = threading.Event()
-        self._thread = self.thread(self._play, 'player')
-        self._thread.start()
 
-    def close(self) -> None:
-        """Stop playing."""
+    def configure(self) -> None:
+        """Look what is in the bag."""
+        self.outputs = {topic: self.publisher(topic) for topic in self._topics()}
+        if self.settings.clock:
+            self._clock_output = self.managed_publisher(Clock, CLOCK, QoSProfile(depth=10))
+
+    def activate(self) -> None:
+        """Play it from its start."""
+        self._stop.clear()
+        player = self.thread(self._play, 'player')
+        player.start()
+        self.undo(self._stop_playing, player)
+
+    def _stop_playing(self, player: threading.Thread) -> None:
         self._stop.set()
         if self._paced is not None:
             self._paced.stop()
-        self._thread.join(timeout=10.0)
+        player.join(timeout=10.0)
 
     def _topics(self) -> list[str]:
         with open_bag(self.path) as reader:
@@ -88,7 +98,7 @@ class ReplayerNode(PackageNode):
             going = self.settings.loop
         if not self._stop.is_set():
             await_acknowledged(self.outputs.values())
-        self.finish()
+            self.finish()
 
     def _wait_for_listeners(self) -> bool:
         """Begin when enough subscriptions listen to the bag's busiest kind of sensor."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from continuum_loc.measurements import Measurement
+from continuum_loc.measurements import BaseSample, Measurement
 from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import ShapeNodeSettings
 from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
@@ -26,24 +26,27 @@ AFTER_TARING = 1.0  # s of the rehearsal: estimates, and a check of the wiring
 class ShapeNode(WorkerNode):
     """The shape estimator on a graph."""
 
-    inputs = ('imu/data_raw', 'imu/mag')
+    inputs = ('imu/data_raw', 'imu/mag', 'joint_states', 'base/pose', 'base/odom')
 
     def __init__(self, **options: Any) -> None:
         super().__init__('shape', ShapeNodeSettings(), **options)
         self.check_parameters()
+        self.estimator: ShapeEstimator | None = None
+        self.estimate: ShapeEstimate | None = None
+
+    def prepare(self) -> None:
+        """Compile the estimator, offer services and outputs."""
         chosen = (
             load_shape_settings(self.settings.settings)
             if self.settings.settings
             else ShapeSettings()
         )
-        self.estimator = ShapeEstimator(self.robot, chosen)
-        self.estimate: ShapeEstimate | None = None
+        self.estimator, self.estimate = ShapeEstimator(self.robot, chosen), None
         self.get_logger().info('compiling, or loading what an earlier run compiled')
         rehearse(self.robot, chosen)
         for topic in ('shape/poses', 'shape/curve'):
             self.publisher(topic)
-        self.create_service(Trigger, '~/reset', self._reset)
-        self.begin()
+        self.serve(Trigger, '~/reset', self._reset)
 
     def consume(self, measurement: Measurement) -> int | None:
         """One sample through the estimator; publish when an estimate fell due."""
@@ -80,7 +83,8 @@ class ShapeNode(WorkerNode):
 
     def summary(self) -> dict[str, Any]:
         """Add the estimator's own counts."""
-        return super().summary() | {'estimator': dict(self.estimator.counts)}
+        counts = dict(self.estimator.counts) if self.estimator else {}
+        return super().summary() | {'estimator': counts}
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.in_worker(self._start_over)
@@ -100,8 +104,11 @@ def rehearse(robot: RobotDescription, settings: ShapeSettings) -> ShapeEstimate 
     """
     own = settings.model_copy(update={'calibration': None, 'start': 'straight'})
     estimator, arm = ShapeEstimator(robot, own), Arm(robot)
+    told = ()
+    if robot.base.mode == 'measured':
+        told = (BaseSample(0, robot.base.measurement.frame, robot.base.T_map_base),)
     at_rest = Motion([arm.posture()], [own.taring_seconds + AFTER_TARING], [0.0])
-    made = [estimator.process(sample) for sample in arm.record(at_rest)]
+    made = [estimator.process(sample) for sample in (*told, *arm.record(at_rest))]
     return next((estimate for estimate in reversed(made) if estimate is not None), None)
 
 

@@ -14,8 +14,9 @@ import threading
 from typing import Any
 
 from continuum_loc.nodes.support.delivery import await_acknowledged, await_listeners
+from continuum_loc.nodes.support.managed import PackageNode
 from continuum_loc.nodes.support.pacing import Paced
-from continuum_loc.nodes.support.runtime import Delays, PackageNode, run, write_summary
+from continuum_loc.nodes.support.runtime import Delays, run, write_summary
 from continuum_loc.nodes.support.settings import SimulatorNodeSettings
 from continuum_loc.robot import load_robot
 from msg_tools.factory import ros_messages
@@ -30,24 +31,35 @@ class SimulatorNode(PackageNode):
         super().__init__('simulator', SimulatorNodeSettings(), **options)
         self.check_parameters()
         self.robot = load_robot(self.settings.robot)
-        self.world = self._world()
         self.published: Counter[str] = Counter()
         self.delays = Delays()
-        self.outputs = {topic: self.publisher(topic) for topic in self._topics()}
-        self._diagnostics = self.publisher('/diagnostics')
+        self.outputs: dict[str, Any] = {}
         self._state = 'preparing'
         self._failure: BaseException | None = None
-        self._paced = Paced(self._stamped(), self.settings.lookahead)
         self._shift: int | None = None
-        self._thread = threading.Thread(target=self._simulate, name='simulation', daemon=True)
-        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
-        self._thread.start()
 
-    def close(self) -> None:
-        """Stop the simulation and write the summary; raise what ended the simulation, if any."""
+    def configure(self) -> None:
+        """Make the world and its outputs."""
+        self.world = self._world()
+        self.outputs = {topic: self.publisher(topic) for topic in self._topics()}
+        self._diagnostics = self.publisher('/diagnostics')
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+
+    def activate(self) -> None:
+        """Begin the trajectory, from its start."""
+        self._state = 'preparing'
+        self._paced = Paced(self._stamped(), self.settings.lookahead)
+        simulation = threading.Thread(target=self._simulate, name='simulation', daemon=True)
+        simulation.start()
+        self.undo(self._stop_simulation, simulation)
+
+    def _stop_simulation(self, simulation: threading.Thread) -> None:
         self._paced.stop()
         self._state = self._state if self._state == 'finished' else 'stopped'
-        self._thread.join(timeout=10.0)
+        simulation.join(timeout=10.0)
+
+    def close(self) -> None:
+        """Write the summary; raise what ended the simulation, if anything did."""
         write_summary(
             self.settings.summary_file,
             {
@@ -105,7 +117,8 @@ class SimulatorNode(PackageNode):
         except BaseException as error:
             if self.context.ok():
                 self._failure = error
-        self.finish()
+        if self._state != 'stopped':
+            self.finish()
 
     def _wait_for_listeners(self) -> bool:
         return await_listeners(

@@ -8,7 +8,9 @@ import sys
 from typing import Any
 
 from continuum_loc.errors import MessageError
-from continuum_loc.nodes.support.runtime import deserialized, input_qos, PackageNode, run
+from continuum_loc.nodes.support.managed import PackageNode
+from continuum_loc.nodes.support.quality import input_qos
+from continuum_loc.nodes.support.runtime import deserialized, run
 from continuum_loc.nodes.support.settings import ViewerNodeSettings
 from continuum_loc.nodes.support.web import answers_of, Seen, Server, SHOWN
 from msg_tools.topics import topic_spec
@@ -25,20 +27,23 @@ class ViewerNode(PackageNode):
         super().__init__('viewer', ViewerNodeSettings(), **options)
         self.check_parameters()
         self.seen = Seen(self.settings.map_points, self.settings.cloud_points)
-        self.server = self._serve()
+
+    def configure(self) -> None:
+        """Serve the page, which is empty yet."""
+        server = self._serve()
+        self.undo(server.server_close)
+        self.undo(server.shutdown)
+        host, port = server.server_address[:2]
+        self.get_logger().info(f'watch at http://{host}:{port}/')
+
+    def activate(self) -> None:
+        """Hear what is shown."""
         for topic in (*SHOWN, '/diagnostics'):
             spec = topic_spec(topic)
             qos = input_qos(spec, spec.latched)
             if spec.latched:
                 qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
             self.listen(spec.type, topic, partial(self._receive, topic), qos, raw=True)
-        host, port = self.server.server_address[:2]
-        self.get_logger().info(f'watch at http://{host}:{port}/')
-
-    def close(self) -> None:
-        """Stop serving."""
-        self.server.shutdown()
-        self.server.server_close()
 
     def _receive(self, topic: str, data: bytes) -> None:
         try:

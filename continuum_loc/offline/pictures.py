@@ -30,7 +30,7 @@ def draw(folder: Path, stem: Path) -> list[Path]:
     from PIL import Image
 
     run = load_run(folder)
-    painter = _Painter(run, context_of(run))
+    painter = Painter(run, context_of(run))
     chosen = np.linspace(0, len(run.result.track) - 1, FRAMES).round().astype(int)
     images = [Image.fromarray(painter.picture(index)) for index in chosen]
     stem.parent.mkdir(parents=True, exist_ok=True)
@@ -49,13 +49,13 @@ def draw(folder: Path, stem: Path) -> list[Path]:
     return [still, moving]
 
 
-class _Painter:
+class Painter:
     """Draws one instant of a run; what stays the same is prepared once."""
 
     def __init__(self, run: Run, context: Context) -> None:
         self.run = run
         self.robot = RobotDescription.model_validate(run.configuration['robot'])
-        self.camera = _camera(*swept_box(run.result, 0.0))
+        self.camera = camera_on(*swept_box(run.result, 0.0))
         low, high = swept_box(run.result, REACH)
         points = context.map_points if context.map_points is not None else np.empty((0, 3))
         points = points[
@@ -121,7 +121,7 @@ def dots(points: np.ndarray, radius: float, colour: tuple[float, float, float]) 
     return Shape(vertices, faces, colour)
 
 
-def _camera(low: np.ndarray, high: np.ndarray) -> Camera:
+def camera_on(low: np.ndarray, high: np.ndarray) -> Camera:
     """
     Look from the side (against y) and a little above, so that the swept box fills the picture.
 

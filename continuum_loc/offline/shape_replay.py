@@ -17,11 +17,11 @@ class ShapeReplay:
     """
     `ShapeEstimator` in the form that `replay.replay` asks of a filter.
 
-    Poses are those of the modules' rings. The base is where the description says, exactly; strain
-    and velocity are not estimated, and nan.
+    Poses are those of the modules' rings. The base is where the description says, or where it is
+    told to be; strain and velocity are not estimated, and nan.
     """
 
-    inputs = ('imu/data_raw', 'imu/mag')
+    inputs = ('imu/data_raw', 'imu/mag', 'joint_states', 'base/pose', 'base/odom')
 
     def __init__(self, robot: RobotDescription, settings: ShapeSettings) -> None:
         self.estimator = ShapeEstimator(robot, settings)
@@ -57,7 +57,7 @@ class ShapeReplay:
         if shape is None:
             return None
         curve, s = self._evened(shape)
-        return as_estimate(shape, curve, s, self.robot.base.T_map_base)
+        return as_estimate(shape, curve, s)
 
     def reset(self) -> None:
         """Start over with taring."""
@@ -81,9 +81,7 @@ class ShapeReplay:
         return np.column_stack([np.interp(at, s, column) for column in curve.T]), at
 
 
-def as_estimate(
-    shape: ShapeEstimate, curve: np.ndarray, curve_s: np.ndarray, T_map_base: np.ndarray
-) -> Estimate:
+def as_estimate(shape: ShapeEstimate, curve: np.ndarray, curve_s: np.ndarray) -> Estimate:
     """Give the shape and a curve (C, 3) at arclengths (C,) as an `Estimate` of base and rings."""
     rings = 1 + len(shape.modules)
     unknown = np.full((rings, 6), np.nan)
@@ -91,7 +89,7 @@ def as_estimate(
     T_map_backbone[:, :3, 3] = curve
     return Estimate(
         stamp=shape.stamp,
-        T_map_ring=np.concatenate([T_map_base[None], shape.T_map_module]),
+        T_map_ring=np.concatenate([shape.T_map_base[None], shape.T_map_module]),
         covariance=np.concatenate([np.full((1, 6, 6), np.nan), shape.covariance]),
         strain=unknown,
         velocity=unknown,

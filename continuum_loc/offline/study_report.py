@@ -35,11 +35,13 @@ def write_study_report(
     tables: dict[str, list[dict[str, Any]]],
     outcomes: Sequence[Outcome],
     runs: Path | None = None,
+    pictures: Sequence[Part] = (),
 ) -> Path:
     """
     Write `out/report.html`. The worst trial is the one with the greatest mean error.
 
-    tables: by title, as rows. runs: the campaign's folder, by default `out`.
+    tables: by title, as rows. runs: the campaign's folder, by default `out`. pictures: shown below
+    the tables.
     """
     ranked = sorted(
         (one for one in outcomes if one.summary is not None),
@@ -55,6 +57,7 @@ def write_study_report(
     groups = [
         [claims_part(claims)],
         *([Part(name, table=as_table(rows))] for name, rows in tables.items()),
+        *([picture] for picture in pictures),
         [worst_part(ranked)],
     ]
     if failed:

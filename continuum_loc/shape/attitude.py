@@ -28,6 +28,9 @@ class AttitudeSettings(Settings):
     gate: float = Field(
         0.4, gt=0.0, description='no correction while |a| departs from g by more [m/s^2]'
     )
+    carried: float = Field(
+        10.0, ge=1.0, description='how much more slowly while the base is carried'
+    )
     bias_sigma: float = Field(
         1e-4, ge=0.0, description='what the rest average leaves of the gyro bias [rad/s]'
     )
@@ -50,10 +53,17 @@ class GravityFilter:
         self._start, self.stamp, self._yaw_sigma, self._period = stamp, stamp, yaw_sigma, 0.0
         self.rate = np.zeros(3)
 
-    def update(self, stamp: int, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
-        """Carry R_map_imu (3, 3) to `stamp` with gyro (3,) [rad/s] and accel (3,) [m/s^2]."""
+    def update(
+        self, stamp: int, gyro: np.ndarray, accel: np.ndarray, moving: bool = False
+    ) -> np.ndarray:
+        """
+        Carry R_map_imu (3, 3) to `stamp` with gyro (3,) [rad/s] and accel (3,) [m/s^2].
+
+        moving: the arm is carried, and accelerates in ways that the gate does not see.
+        """
         dt = seconds(stamp, self.stamp)
-        gain = 1.0 - math.exp(-dt / self.settings.time_constant)
+        slowly = self.settings.carried if moving else 1.0
+        gain = 1.0 - math.exp(-dt / (slowly * self.settings.time_constant))
         rate = gyro - self.bias
         # The mean of the rates at both ends integrates a smooth motion to second order.
         used = _turn_and_level(

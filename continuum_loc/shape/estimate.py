@@ -19,7 +19,8 @@ class ShapeEstimate:
     """
     The arm at one instant; M modules base to tip, named by their rings.
 
-    T_map_module: (M, 4, 4). covariance: (M, 6, 6) of a right perturbation [rho; phi] (m, rad).
+    T_map_module: (M, 4, 4); T_map_base: (4, 4) of the inserted base.
+    covariance: (M, 6, 6) of a right perturbation [rho; phi] (m, rad).
     curve: (C, 3) points in map from the magnet to the tip [m], at arclengths curve_s (C,) [m].
     observable: (M,) whether the module's own field fixes its position.
     bound: (M, 3) of `PositionFit`.
@@ -40,6 +41,7 @@ class ShapeEstimate:
     status: Status
     faults: Faults
     consistency: float
+    T_map_base: np.ndarray
 
 
 def described(faults: Faults) -> str:
@@ -48,7 +50,10 @@ def described(faults: Faults) -> str:
 
 
 def curve_through(
-    T_base_module: np.ndarray, robot: RobotDescription, settings: ShapeSettings
+    T_base_module: np.ndarray,
+    T_map_base: np.ndarray,
+    robot: RobotDescription,
+    settings: ShapeSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (C, 3) in map and arclengths (C,), from the magnet through the modules to the tip."""
     s = robot.magnet.s
@@ -60,5 +65,5 @@ def curve_through(
         fit_curve(points, tangents, settings.curve, settings.curve_points), robot.length - s
     )
     curve[:, 0] += s
-    R, p = robot.base.T_map_base[:3, :3], robot.base.T_map_base[:3, 3]
+    R, p = T_map_base[:3, :3], T_map_base[:3, 3]
     return curve @ R.T + p, arclength(curve) + s

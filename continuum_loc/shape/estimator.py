@@ -14,8 +14,15 @@ from __future__ import annotations
 from collections import Counter
 
 from continuum_loc.errors import MeasurementError
-from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds
+from continuum_loc.measurements import (
+    BaseSample,
+    EncoderSample,
+    FieldSample,
+    ImuSample,
+    nanoseconds,
+)
 from continuum_loc.robot import RobotDescription
+from continuum_loc.shape.base_motion import BaseMotion
 from continuum_loc.shape.calibration import (
     calibrated_mounts,
     Calibration,
@@ -69,13 +76,14 @@ class ShapeEstimator:
         self.message = ''
         self.faults: Faults = {}
         self.counts: Counter[str] = Counter()
-        self._modules = [Module(m, self.robot, self.settings) for m in places]
+        self._base = BaseMotion(self.robot)
+        self._modules = [Module(m, self.robot, self.settings, self._base) for m in places]
         self._by_sensor = {
             sensors[m].name: self._modules[m]
             for m in places
             for sensors in (self.robot.imu, self.robot.hall)
         }
-        self._taring: Taring | None = Taring(self.robot, self.settings, self._given)
+        self._taring: Taring | None = Taring(self.robot, self.settings, self._given, self._base)
         self._latest = straight_modules(self.robot)  # T_base_module of the last estimate
 
     @property
@@ -83,13 +91,19 @@ class ShapeEstimator:
         """Names of the modules' rings, base to tip."""
         return tuple(sensor.ring for sensor in self.robot.hall)
 
-    def process(self, sample: ImuSample | FieldSample) -> ShapeEstimate | None:
+    def process(
+        self, sample: ImuSample | FieldSample | BaseSample | EncoderSample
+    ) -> ShapeEstimate | None:
         """
         Take one sample; an estimate when one fell due.
 
+        Where the base is, and how far inserted, is noted for those of the modules that follow.
         Samples of other sensors are counted and ignored. Raises MeasurementError for an IMU sample
         that is not finite: no full scale can be the reason.
         """
+        if isinstance(sample, (BaseSample, EncoderSample)):
+            self.counts['used' if self._base.take(sample) else 'ignored'] += 1
+            return None
         module = self._by_sensor.get(getattr(sample, 'sensor', None))
         if module is None or not isinstance(sample, (ImuSample, FieldSample)):
             self.counts['ignored'] += 1
@@ -134,7 +148,7 @@ class ShapeEstimator:
         for module in self._modules:
             module.use(mounts)
             module.start(stamp, tared.rest, tared.yaw_sigma)
-        self._solver = PoseSolver(self.robot, tared.calibration, self.settings)
+        self._solver = PoseSolver(self.robot, tared.calibration, self.settings, self._base)
         self._watch = Watch(self.robot, self.settings, self._solver, self._modules)
         self._taring, self._next_due = None, stamp
         self.status, self.message, self.faults = 'tracking', '', {}
@@ -175,11 +189,12 @@ class ShapeEstimator:
             self.faults[name] = (*self.faults.get(name, ()), *texts)
         self.status = 'degraded' if self.faults else 'tracking'
         self.message = described(self.faults)
-        curve, curve_s = curve_through(poses.T_base_module, self.robot, self.settings)
+        T_map_base = self._base.pose(stamp)
+        curve, curve_s = curve_through(poses.T_base_module, T_map_base, self.robot, self.settings)
         return ShapeEstimate(
             stamp,
             self.module_names,
-            self.robot.base.T_map_base @ poses.T_base_module,
+            T_map_base @ poses.T_base_module,
             poses.covariance,
             curve,
             curve_s,
@@ -189,4 +204,5 @@ class ShapeEstimator:
             self.status,
             dict(self.faults),
             self._watch.consistency,
+            T_map_base,
         )

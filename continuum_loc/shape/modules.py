@@ -8,6 +8,7 @@ from continuum_loc.measurements import FieldSample, ImuSample
 from continuum_loc.plausible import Turns
 from continuum_loc.robot import RobotDescription
 from continuum_loc.shape.attitude import GravityFilter, level
+from continuum_loc.shape.base_motion import BaseMotion
 from continuum_loc.shape.calibration import ModuleMounts
 from continuum_loc.shape.rest import Rest
 from continuum_loc.shape.settings import ShapeSettings
@@ -47,7 +48,9 @@ class Module:
     after a rest; before both it only notes readings.
     """
 
-    def __init__(self, place: int, robot: RobotDescription, settings: ShapeSettings) -> None:
+    def __init__(
+        self, place: int, robot: RobotDescription, settings: ShapeSettings, base: BaseMotion
+    ) -> None:
         imu, hall = robot.imu_model, robot.hall_model
         self.place, self.name = place, robot.hall[place].ring
         self.attitude = GravityFilter(settings.attitude, imu.gyro_sigma, imu.accel_sigma)
@@ -59,7 +62,7 @@ class Module:
         self.averaged = 0
         # The IMU was silent or frozen: its attitude is stale until it starts again.
         self.lost = False
-        self._R_map_base = robot.base.T_map_base[:3, :3]
+        self._base = base
         self._still = settings.still
         self._gain = min(1.0, 1.0 / (hall.rate * max(settings.smoothing, 1e-9)))
 
@@ -73,6 +76,7 @@ class Module:
         """Begin at the rotation of the straight robot, levelled to the gravity of a rest."""
         m = self.place
         self.rest_accel, self.rest_field = rest.accel[m] - self.accel_offset, rest.field[m]
+        self._R_map_rest = self._base.rotation(stamp)
         R_map_imu = self._levelled(self.rest_accel)
         self.attitude.start(stamp, R_map_imu, rest.gyro[m], yaw_sigma)
         if np.isfinite(rest.field[m]).all():
@@ -82,7 +86,7 @@ class Module:
 
     def _levelled(self, accel: np.ndarray) -> np.ndarray:
         """R_map_imu at the straight robot, turned by the least angle so that `accel` points up."""
-        return level(self._R_map_base @ self.R_module_imu, accel)
+        return level(self._R_map_rest @ self.R_module_imu, accel)
 
     def turn(self, sample: ImuSample, R_base_module: np.ndarray) -> None:
         """Carry the attitude on. An IMU that was lost starts again at the backbone's rotation."""
@@ -91,10 +95,12 @@ class Module:
             if self.imu.repeats > 1:
                 return
             self.lost = False
-            R_map_imu = level(self._R_map_base @ R_base_module @ self.R_module_imu, accel)
+            R_map_base = self._base.rotation(sample.stamp)
+            R_map_imu = level(R_map_base @ R_base_module @ self.R_module_imu, accel)
             self.attitude.start(sample.stamp, R_map_imu, self.attitude.bias, RESUMED_YAW)
             self.turns.clear()
-        self.attitude.update(sample.stamp, sample.angular_velocity, accel)
+        moving = self._base.moves(sample.stamp)
+        self.attitude.update(sample.stamp, sample.angular_velocity, accel, moving)
         self.turns.add(sample.stamp, self.attitude.rate, accel)
 
     def sense(self, sample: FieldSample) -> None:
@@ -112,7 +118,8 @@ class Module:
 
     def R_base_module(self, stamp: int) -> np.ndarray:
         """(3, 3) rotation at `stamp`, a little after the last sample."""
-        return self._R_map_base.T @ self.attitude.rotation_at(stamp) @ self.R_module_imu.T
+        R_map_imu = self.attitude.rotation_at(stamp)
+        return self._base.rotation(stamp).T @ R_map_imu @ self.R_module_imu.T
 
     def R_base_module_if(self, stamp: int, axes: np.ndarray) -> np.ndarray:
         """
@@ -123,4 +130,4 @@ class Module:
         """
         begun = self._levelled(axes @ self.rest_accel) @ axes @ self._levelled(self.rest_accel).T
         R_map_imu = begun @ self.attitude.rotation_at(stamp) @ axes.T
-        return self._R_map_base.T @ R_map_imu @ self.R_module_imu.T
+        return self._base.rotation(stamp).T @ R_map_imu @ self.R_module_imu.T

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from continuum_loc.robot import RobotDescription
 from continuum_loc.shape.backbone import BackboneFit, BackboneSolver, MAX_ITERATIONS
+from continuum_loc.shape.base_motion import BaseMotion
 from continuum_loc.shape.calibration import Calibration, straight_modules
 from continuum_loc.shape.modules import Module
 from continuum_loc.shape.position import PositionSolver
@@ -52,14 +53,17 @@ class PoseSolver:
     """Both ways to solve, with what follows from one calibration of `robot`."""
 
     def __init__(
-        self, robot: RobotDescription, calibration: Calibration, settings: ShapeSettings
+        self,
+        robot: RobotDescription,
+        calibration: Calibration,
+        settings: ShapeSettings,
+        base: BaseMotion,
     ) -> None:
         magnet = robot.magnet.model_copy(update={'remanence': calibration.remanence})
         s = straight_modules(robot)[:, 0, 3]
-        self._R_base_map = robot.base.T_map_base[:3, :3].T
-        self._earth = self._R_base_map @ calibration.earth_field
+        self._base, self._earth_map = base, calibration.earth_field
         self._sigma, self._left = robot.hall_model.sigma, calibration.mounting_sigma
-        self._mounting = self._left**2 * np.eye(3)
+        self._mounting = (self._left**2 + base.variance) * np.eye(3)
         self._magnet_at = np.array([magnet.s, 0.0, 0.0])
         self._positions = PositionSolver(magnet, s - magnet.s, settings.field_model)
         self._backbone = BackboneSolver(
@@ -68,6 +72,7 @@ class PoseSolver:
 
     def snapshot(self, modules: Sequence[Module], good: np.ndarray, stamp: int) -> Snapshot:
         """Bring all modules to one stamp. The field of a module that is not `good` is left out."""
+        R_base_map = self._base.rotation(stamp).T
         attitude = np.stack([module.attitude.covariance for module in modules])
         fields = [m.field_base if good[m.place] else np.zeros(3) for m in modules]
         return Snapshot(
@@ -75,8 +80,8 @@ class PoseSolver:
             good,
             np.stack([module.R_base_module(stamp) for module in modules]),
             np.stack(fields),
-            self._earth,
-            self._R_base_map @ attitude @ self._R_base_map.T + self._mounting,
+            R_base_map @ self._earth_map,
+            R_base_map @ attitude @ R_base_map.T + self._mounting,
         )
 
     def joint(self, now: Snapshot, iterations: int = MAX_ITERATIONS) -> BackboneFit:

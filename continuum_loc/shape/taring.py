@@ -7,6 +7,7 @@ from typing import NamedTuple
 from continuum_loc.errors import InputError, MotionError
 from continuum_loc.measurements import FieldSample, ImuSample, nanoseconds
 from continuum_loc.robot import RobotDescription
+from continuum_loc.shape.base_motion import BaseMotion
 from continuum_loc.shape.calibration import (
     calibrate,
     Calibration,
@@ -40,9 +41,13 @@ class Taring:
     """
 
     def __init__(
-        self, robot: RobotDescription, settings: ShapeSettings, given: Calibration | None
+        self,
+        robot: RobotDescription,
+        settings: ShapeSettings,
+        given: Calibration | None,
+        base: BaseMotion,
     ) -> None:
-        self.robot, self.settings, self._given = robot, settings, given
+        self.robot, self.settings, self._given, self._base = robot, settings, given, base
         self.status: Status = 'taring'
         self.message = ''
         self.faults: Faults = {}
@@ -57,8 +62,11 @@ class Taring:
             self._window.add(sample)
             return None
         window, self._window, self._end = self._window, RestWindow(self.robot), None
+        if not self._base.known:
+            self.status, self.message = 'taring', 'nobody has told where the base is'
+            return None
         try:
-            return self._judged(window)
+            return self._judged(window, self._base.pose(sample.stamp))
         except InputError as error:
             self.status = 'taring' if isinstance(error, MotionError) else 'faulty'
             self.message = str(error)
@@ -69,7 +77,7 @@ class Taring:
         """Whether the next sample begins a new rest."""
         return self._end is None
 
-    def _judged(self, window: RestWindow) -> Tared | None:
+    def _judged(self, window: RestWindow, T_map_base: np.ndarray) -> Tared | None:
         """Units come first: noise in gauss looks like motion, and a field like a wrong wiring."""
         rest, straight = window.means(), self.settings.start == 'straight'
         if self._refused(unit_faults(self.robot, window)):
@@ -77,7 +85,7 @@ class Taring:
         window.check_motion()
         if not straight:
             return Tared(rest, self._given or nominal_calibration(self.robot), UNKNOWN_YAW)
-        posed = PosedRest(rest, self.robot.base.T_map_base, straight_modules(self.robot))
+        posed = PosedRest(rest, T_map_base, straight_modules(self.robot))
         check_wiring(self.robot, posed, self.settings.field_model)
         if self._refused(axis_faults(self.robot, posed, self.settings.field_model)):
             return None

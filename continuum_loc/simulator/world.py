@@ -37,7 +37,6 @@ from continuum_loc.simulator.plant import (
     node_arclengths,
     PlantSettings,
 )
-from continuum_loc.simulator.readout import ReadoutSettings
 from continuum_loc.simulator.trajectories import Drive, levelled, trajectory
 import numpy as np
 
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
 TRUTH_RATE = 100.0
 ENCODER_RATE = 50.0
 ENCODER_SIGMA = 1e-4  # m, tendon displacement
-DEFAULT_START = NANOSECONDS
+START = NANOSECONDS  # stamp of the first sample
 
 _log = logging.getLogger(__name__)
 
@@ -75,8 +74,8 @@ class World:
     plant: PlantSettings, a name or a YAML file; None takes the bundled plant of the robot's name.
     trajectory: a name of `trajectories.trajectory`, or a Drive.
     scene: None is empty space, without ToF frames.
-    tof_settings, readout: how ToF sensors of the fidelity `vl53l5cx` depart from ideal, and how
-    their frames come; None takes what public flights show.
+    tof_settings: how ToF sensors of the fidelity `vl53l5cx` depart from ideal; None takes what
+    public flights show.
     T_magnet_true: (4, 4), where the magnet sits in the frame where it should; None: there.
     faults: wrappers of `faults`, applied to the stream in order.
     carried: what carries the base, a name of `carrier.carrier` or a Carrier; None: it stands.
@@ -92,20 +91,12 @@ class World:
         profile: str = 'live',
         tof_fidelity: str = 'paper',
         tof_settings: Vl53l5cxSettings | None = None,
-        readout: ReadoutSettings | None = None,
         T_magnet_true: np.ndarray | None = None,
         seed: int = 0,
         faults: tuple = (),
-        start_stamp: int = DEFAULT_START,
         carried: Carrier | str | None = None,
     ) -> None:
-        self.robot, self.scene, self.seed, self.faults, self.start_stamp = (
-            robot,
-            scene,
-            seed,
-            faults,
-            start_stamp,
-        )
+        self.robot, self.scene, self.seed, self.faults = robot, scene, seed, faults
         self.plant = plant if isinstance(plant, PlantSettings) else _plant(plant, robot)
         self.carried = carrier(carried, robot) if isinstance(carried, str) else carried
         if self.carried is not None and robot.name == 'engine' and isinstance(trajectory, str):
@@ -114,7 +105,7 @@ class World:
         self.nodes_s = node_arclengths(robot, self.plant, self.plant.profile(profile).link_length)
         _check_fidelity(tof_fidelity)
         self.tof_fidelity, self.tof_settings = tof_fidelity, tof_settings
-        self.readout, self.T_magnet_true = readout or ReadoutSettings(), T_magnet_true
+        self.T_magnet_true = T_magnet_true
         supported = self.trajectory.supported
         model = build_model(robot, self.plant, scene, profile, supported, self.carried)
         self.body = _Body(robot, self.plant, model, self.trajectory, self.carried)
@@ -154,7 +145,7 @@ class World:
             self._now = stamp / NANOSECONDS
             while not self.motion.covers(self._now):
                 self.motion.append(self.body.step())
-            yield from streams[stream].sample(self.start_stamp + stamp, self._now)
+            yield from streams[stream].sample(START + stamp, self._now)
 
     def _streams(self) -> list[_Stream]:
         """Sensors in a fixed order, each with its own random stream."""
@@ -267,18 +258,19 @@ class World:
     def _real_tof_streams(self, rng: np.random.Generator) -> Iterator[_Stream]:
         """Yield one stream per sensor: real ones are out of step, and each has its own rate."""
         from continuum_loc.simulator.raycast import RayCaster
-        from continuum_loc.simulator.readout import Readout
+        from continuum_loc.simulator.readout import Readout, ReadoutSettings
         from continuum_loc.simulator.tof import TofSensorModel
 
         caster, rate = RayCaster(self.scene), self.robot.tof_model.rate
+        readout = ReadoutSettings()
         for sensor in self.robot.tof:
             own = np.random.default_rng(rng.integers(2**63))
             model = TofSensorModel(
                 self.robot.tof_model, caster, self.tof_fidelity, own, self.tof_settings
             )
             phase = own.uniform(0.0, 1.0 / rate)
-            true_rate = rate * (1.0 + self.readout.rate_tolerance * own.standard_normal())
-            sample = self._read_out(model, sensor, Readout(self.readout, own))
+            true_rate = rate * (1.0 + readout.rate_tolerance * own.standard_normal())
+            sample = self._read_out(model, sensor, Readout(readout, own))
             yield _Stream(true_rate, sample, phase)
 
     def _read_out(

@@ -7,6 +7,7 @@ from continuum_loc.estimator.factors.base_pose import BasePoseFactor
 from continuum_loc.estimator.factors.field import FieldFactor
 from continuum_loc.estimator.factors.gravity import GravityFactor
 from continuum_loc.estimator.factors.gyro import GyroFactor
+from continuum_loc.estimator.factors.mechanics import MechanicsFactor
 from continuum_loc.estimator.factors.pose import InsertionFactor, TrackerFactor
 from continuum_loc.estimator.factors.strain import StrainFactor
 from continuum_loc.estimator.factors.tof import TofFactor
@@ -17,6 +18,7 @@ FACTORS: tuple[type[Factor], ...] = (
     TrackerFactor,
     InsertionFactor,
     BasePoseFactor,
+    MechanicsFactor,
     GravityFactor,
     FieldFactor,
     TofFactor,

@@ -49,7 +49,10 @@ class FieldFactor(Factor):
         }
         if robot.magnet is not None:
             along = np.array([robot.magnet.s, 0.0, 0.0, 0.0, 0.0, 0.0])
-            self._T_map_magnet = robot.base.T_map_base @ lie.exp(along)
+            self._T_base_magnet = lie.exp(along)
+            self._T_map_magnet = robot.base.T_map_base @ self._T_base_magnet
+        # A base that is carried or inserted takes the magnet along.
+        self._goes = robot.base.mode != 'fixed' or robot.base.insertion.mode != 'fixed'
 
     def row(self, measurement: FieldSample) -> Row:
         if self.robot.magnet is None:
@@ -68,17 +71,50 @@ class FieldFactor(Factor):
 
     def linearise(self, batch, a, b, normal):
         at = interpolated(a, b, batch.times, batch.nodes, pose=True)
-        earth = np.array(self.settings.field.earth)
-        e, J = field_residual_and_jacobian(
-            at.T, self.robot.magnet, self._T_map_magnet, batch.measured, earth
-        )
+        base = interpolated(a, b, batch.times, np.zeros_like(batch.nodes), pose=True)
+        e, J, J_base = self._residuals(batch, at.T, base.T)
         u2 = batch.weights * np.sum(e**2, axis=1)
         cauchy2 = self.settings.field.cauchy**2
         robust = 1.0 / (1.0 + u2 / cauchy2)
         weights = np.repeat((batch.weights * robust)[:, None], 3, axis=1)
-        rows, index = J @ at.J_pose, np.empty(24, np.int64)
+        own, of_base, index = J @ at.J_pose, J_base @ base.J_pose, np.empty(24, np.int64)
         for m, node in enumerate(batch.nodes):
             rows_in_time(node, self.grid.dim, index)
-            add_rows(normal, index, e[m], rows[m], weights[m])
+            rows, all_rows = index, own[m]
+            if self._goes and node == 0:
+                all_rows = own[m] + of_base[m]
+            elif self._goes:
+                rows, all_rows = self._with_base(index, own[m], of_base[m])
+            add_rows(normal, rows, e[m], all_rows, weights[m])
         cost = float(np.sum(0.5 * cauchy2 * np.log1p(u2 / cauchy2)))
         return FactorReport(cost, float(u2 @ robust), 3 * len(u2))
+
+    def _residuals(
+        self, batch: Batch, T: np.ndarray, T_map_base: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (M, 3), and Jacobians (M, 3, 6) by the nodes' poses and by the base's."""
+        magnet, earth = self.robot.magnet, np.array(self.settings.field.earth)
+        if not self._goes:
+            e, J = field_residual_and_jacobian(
+                T, magnet, self._T_map_magnet, batch.measured, earth
+            )
+            return e, J, np.zeros_like(J)
+        # The magnet's own field, in a frame that goes with the base; Earth's does not.
+        T_base_node = lie.inverse(T_map_base) @ T
+        source, J = field_residual_and_jacobian(
+            T_base_node, magnet, self._T_base_magnet, np.zeros((len(T), 3))
+        )
+        J_base = -J @ lie.adjoint(lie.inverse(T_base_node))
+        background = np.einsum('mji,j->mi', T[:, :3, :3], earth)
+        J[:, :, 3:] += lie.hat(background)
+        return source + background - batch.measured, J, J_base
+
+    def _with_base(
+        self, index: np.ndarray, own: np.ndarray, of_base: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (48,) of the first node and of another, in increasing order, and J (3, 48)."""
+        base = np.empty(24, np.int64)
+        rows_in_time(0, self.grid.dim, base)
+        rows = np.concatenate([base[:12], index[:12], base[12:], index[12:]])
+        J = np.concatenate([of_base[:, :12], own[:, :12], of_base[:, 12:], own[:, 12:]], axis=1)
+        return rows, np.ascontiguousarray(J)

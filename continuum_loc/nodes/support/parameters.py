@@ -49,16 +49,19 @@ def check_arguments(arguments: Sequence[str]) -> None:
             raise SettingsError(f'{option} {value}: {OCTAL}')
 
 
-def declare(node: Node, defaults: S, prefix: str = '') -> S:
+def declare(node: Node, defaults: S, prefix: str = '', live: bool = False) -> S:
     """
     Declare every field of `defaults`, and return the settings with the user's overrides applied.
 
-    Raises SettingsError naming the parameter, its value and what is valid.
+    Fields that may not change at run time are read-only, unless all are `live`. Raises
+    SettingsError naming the parameter, its value and what is valid.
     """
     for name, field, value in leaves(defaults, prefix):
         _accept_whole_number(node, name, value)
         try:
-            node.declare_parameter(name, _ros_value(value), _descriptor(name, field, value))
+            descriptor = _descriptor(name, field, value)
+            descriptor.read_only = not (live or _is_live(field))
+            node.declare_parameter(name, _ros_value(value), descriptor)
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise SettingsError(
                 f"parameter '{name}' ({field.description}; {constraint(field)}): {error}"
@@ -84,22 +87,41 @@ def refuse_unknown(node: Node) -> None:
     for name in node._parameter_overrides:
         if name in valid or name in _ROS_NAMES or name.startswith(_ROS_PREFIXES):
             continue
-        close = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)
         raise SettingsError(
-            f"{node.get_name()}: unknown parameter '{name}'; did you mean '{close[0]}'? "
+            f"{node.get_name()}: unknown parameter '{name}'; did you mean "
+            f"'{nearest(name, valid)}'? "
             f'Valid: {", ".join(sorted(valid))}'
         )
 
 
+def nearest(name: str, valid: Sequence[str]) -> str:
+    """Return the valid name that is most like one: the whole of it, or its last part."""
+
+    def likeness(other: str) -> tuple[float, float]:
+        parts = [one.rpartition('.')[2] for one in (name, other)]
+        whole, last = (
+            difflib.SequenceMatcher(None, *pair).ratio() for pair in ((name, other), parts)
+        )
+        return max(whole, last), whole
+
+    return max(valid, key=likeness)
+
+
 def guard(node: Node, apply: Callable[[dict[str, Any]], str | None]) -> None:
     """
-    Ask `apply` about every change at run time.
+    Ask `apply` about every change at run time; what stays as it is is none.
 
     It returns the reason why not, or None when it took the values.
     """
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
-        values = {p.name: _plain(p.value) for p in parameters if p.name not in _ROS_NAMES}
+        values = {
+            p.name: _plain(p.value)
+            for p in parameters
+            if p.name not in _ROS_NAMES
+            and not p.name.startswith(_ROS_PREFIXES)
+            and not is_set_to(node, p)
+        }
         try:
             reason = apply(values) if values else None
         except SettingsError as error:
@@ -109,13 +131,10 @@ def guard(node: Node, apply: Callable[[dict[str, Any]], str | None]) -> None:
     node.add_on_set_parameters_callback(on_set)
 
 
-def live_fields(model: type[Settings]) -> set[str]:
-    """Names of the fields that may change at run time (json_schema_extra live=True)."""
-    return {
-        name
-        for name, field in model.model_fields.items()
-        if (field.json_schema_extra or {}).get('live')
-    }
+def is_set_to(node: Node, parameter: Parameter) -> bool:
+    """Whether the node's parameter of this name has this value already."""
+    present = node._parameters.get(parameter.name)
+    return present is not None and _plain(present.value) == _plain(parameter.value)
 
 
 def leaves(settings: Settings, prefix: str) -> Iterator[tuple[str, FieldInfo, Any]]:
@@ -126,6 +145,10 @@ def leaves(settings: Settings, prefix: str) -> Iterator[tuple[str, FieldInfo, An
             yield from leaves(value, f'{prefix}{name}.')
         else:
             yield prefix + name, field, value
+
+
+def _is_live(field: FieldInfo) -> bool:
+    return bool((field.json_schema_extra or {}).get('live'))
 
 
 def _accept_whole_number(node: Node, name: str, default: Any) -> None:

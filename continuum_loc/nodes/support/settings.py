@@ -13,7 +13,16 @@ from continuum_loc.settings import live, Settings
 from pydantic import Field
 
 
-class EstimatorNodeSettings(Settings):
+class NodeSettings(Settings):
+    """What every node has."""
+
+    autostart: bool = Field(
+        True,
+        description='configure and activate by itself; false waits for a manager of lifecycles',
+    )
+
+
+class EstimatorNodeSettings(NodeSettings):
     """Node `estimator`."""
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
@@ -26,10 +35,25 @@ class EstimatorNodeSettings(Settings):
         'own, or else the defaults',
     )
     frame_prefix: str = Field(
-        '', description='put before every frame name except `map` (several robots)'
+        '', description='put before every frame name except `map_frame` (several robots)'
     )
-    publish_tf: bool = live(
-        True, description='map -> base_link -> rings, where tf2_msgs is installed'
+    tf: Literal['base', 'odom', 'rings', 'none'] = Field(
+        'base',
+        description='what is published on /tf, where tf2_msgs is installed: map -> base -> rings; '
+        'map -> odom and base -> rings, where others move the base in `odom`; base -> rings '
+        'alone; or nothing, on /tf_static neither',
+    )
+    map_frame: str = Field(
+        'map', min_length=1, description="name of the prior map's frame, without a prefix"
+    )
+    odom_frame: str = Field(
+        'odom', min_length=1, description='name of the frame in which others move the base'
+    )
+    base_frame: str = Field('base_link', min_length=1, description="name of the base's frame")
+    base_tf: str = Field(
+        '',
+        description='frame on /tf that carries the base: where it is in the `frame` of the robot '
+        "description's base.measurement goes out on `base/pose`, and is heard there; empty: none",
     )
     map_points: int = Field(
         100_000, ge=0, description='most points of the published `prior_map`; 0 for all'
@@ -65,7 +89,7 @@ class EstimatorNodeSettings(Settings):
     intake: IntakeSettings = IntakeSettings()
 
 
-class ShapeNodeSettings(Settings):
+class ShapeNodeSettings(NodeSettings):
     """Node `shape`."""
 
     robot: str = Field('hall_arm', description='robot description: a bundled name or a YAML file')
@@ -85,7 +109,7 @@ class ShapeNodeSettings(Settings):
     intake: IntakeSettings = IntakeSettings()
 
 
-class SimulatorNodeSettings(Settings):
+class SimulatorNodeSettings(NodeSettings):
     """Node `simulator`."""
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
@@ -129,7 +153,7 @@ class SimulatorNodeSettings(Settings):
     )
 
 
-class RecorderNodeSettings(Settings):
+class RecorderNodeSettings(NodeSettings):
     """Node `recorder`."""
 
     bag: str = Field('', description='folder of the new bag; empty for bag_<date>_<time>')
@@ -155,7 +179,7 @@ class RecorderNodeSettings(Settings):
     )
 
 
-class ReplayerNodeSettings(Settings):
+class ReplayerNodeSettings(NodeSettings):
     """Node `replayer`."""
 
     bag: str = Field('', description='bag folder or .mcap file')
@@ -178,7 +202,7 @@ class ReplayerNodeSettings(Settings):
     wait_timeout: float = Field(60.0, gt=0.0, description='give up waiting after this time [s]')
 
 
-class DriverNodeSettings(Settings):
+class DriverNodeSettings(NodeSettings):
     """Node `driver`."""
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
@@ -207,7 +231,7 @@ class DriverNodeSettings(Settings):
     longest_line: int = Field(65_536, ge=256, description='a longer line is refused [bytes]')
 
 
-class ViewerNodeSettings(Settings):
+class ViewerNodeSettings(NodeSettings):
     """Node `viewer`."""
 
     host: str = Field(

@@ -18,15 +18,9 @@ from typing import Any
 from continuum_loc.intake import Intake
 from continuum_loc.measurements import Measurement, NANOSECONDS
 from continuum_loc.nodes.support.inbox import Early, Inbox, Queued
-from continuum_loc.nodes.support.parameters import live_fields
-from continuum_loc.nodes.support.runtime import (
-    Delays,
-    deserialized,
-    input_qos,
-    PackageNode,
-    write_summary,
-)
-from continuum_loc.nodes.support.settings import IntakeSettings
+from continuum_loc.nodes.support.managed import PackageNode
+from continuum_loc.nodes.support.quality import input_qos
+from continuum_loc.nodes.support.runtime import Delays, deserialized, write_summary
 from continuum_loc.robot import load_robot
 from continuum_loc.settings import Settings
 from msg_tools.factory import ros_messages
@@ -46,7 +40,7 @@ class WorkerNode(PackageNode):
     """
     Base of `estimator` and `shape`.
 
-    Subclasses give `inputs`, `consume`, `restart` and `describe`.
+    Subclasses give `inputs`, `prepare`, `consume`, `restart` and `describe`.
     """
 
     inputs: tuple[str, ...] = ()
@@ -69,9 +63,12 @@ class WorkerNode(PackageNode):
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._received_at = 0.0
         self._told: dict[str, int] = {}
-        self._thread = self.thread(self._work, f'{name} worker')
 
     # ------------------------------------------------ for subclasses
+
+    def prepare(self) -> None:
+        """Load and compile what the estimate needs; it may take a minute."""
+        raise NotImplementedError
 
     def consume(self, measurement: Measurement) -> int | None:
         """
@@ -105,9 +102,21 @@ class WorkerNode(PackageNode):
 
     # ------------------------------------------------ life
 
-    def begin(self) -> None:
-        """Subscribe and start to work: call it when everything is ready for data."""
-        self.check_parameters()
+    def configure(self) -> None:
+        """Prepare, and start the worker: while the node is inactive, nothing comes for it."""
+        self.prepare()
+        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
+        # What was loaded and compiled stays: to go through it again and again, as the collector
+        # else does, stops the worker for 30 ms each time.
+        gc.collect()
+        gc.freeze()
+        self._stop.clear()
+        worker = self.thread(self._work, f'{self.get_name()} worker')
+        worker.start()
+        self.undo(self._stop_worker, worker)
+
+    def activate(self) -> None:
+        """Subscribe."""
         for topic in self._input_topics():
             spec = topic_spec(topic)
             self.listen(
@@ -117,20 +126,15 @@ class WorkerNode(PackageNode):
                 input_qos(spec, self.settings.intake.reliable_inputs),
                 raw=True,
             )
-        self.every(1.0 / self.settings.diagnostics_rate, self._publish_diagnostics)
-        # What was loaded and compiled stays: to go through it again and again, as the collector
-        # else does, stops the worker for 30 ms each time.
-        gc.collect()
-        gc.freeze()
-        self._thread.start()
         self.get_logger().info(f"ready: robot '{self.robot.name}'")
 
     def close(self) -> None:
-        """Stop the worker and write the summary."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=10.0)
+        """Write the summary."""
         write_summary(self.settings.summary_file, self.summary())
+
+    def _stop_worker(self, worker: threading.Thread) -> None:
+        self._stop.set()
+        worker.join(timeout=10.0)
 
     def counts(self) -> dict[str, Any]:
         """
@@ -164,6 +168,7 @@ class WorkerNode(PackageNode):
         """Return the publisher of a topic of the contract."""
         if topic not in self.outputs:
             self.outputs[topic] = super().publisher(topic)
+            self.undo(self.outputs.pop, topic)
         return self.outputs[topic]
 
     # ------------------------------------------------ reception (executor thread)
@@ -178,11 +183,15 @@ class WorkerNode(PackageNode):
 
     def _receive(self, topic: str, data: bytes) -> None:
         self._received_at = time.monotonic()
-        message = self.intake.parse(topic, data, deserialized)
+        message = self.intake.parse(topic, data, self.deserialized)
         if message is None:
             self.inbox.received[topic] += 1
         else:
             self.inbox.put(topic, message, self.now(), len(data))
+
+    def deserialized(self, data: bytes, type_name: str) -> Any:
+        """Return the message of the bytes that came."""
+        return deserialized(data, type_name)
 
     # ------------------------------------------------ estimation (worker thread)
 
@@ -220,11 +229,6 @@ class WorkerNode(PackageNode):
 
     # ------------------------------------------------ parameters, diagnostics
 
-    def live_parameters(self) -> set[str]:
-        """Return those of the node and of its intake."""
-        intake = {f'intake.{name}' for name in live_fields(IntakeSettings)}
-        return super().live_parameters() | intake
-
     def _change(self, values: dict[str, Any]) -> str | None:
         reason = super()._change(values)
         self.inbox.settings = self.intake.settings = self.intake.gate.settings = (
@@ -237,8 +241,9 @@ class WorkerNode(PackageNode):
         self.get_logger().warning(text + more)
 
     def _publish_diagnostics(self) -> None:
-        level, text, values = self.describe()
-        for check in (self._check_losses, self._check_lag, self._check_silence):
+        level, text, values = self.describe() if self.active else (OK, 'inactive', {})
+        checks = (self._check_losses, self._check_lag, self._check_silence) if self.active else ()
+        for check in checks:
             level, text = max((level, text), check(), key=lambda pair: pair[0])
         values = {
             'received': sum(self.inbox.received.values()),
