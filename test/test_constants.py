@@ -30,6 +30,7 @@ from worlds import EPOCH, EXACT, Rod, rod, room_map, stream
 
 DT = 0.1
 BUILT = Tolerances()
+FLAT = parse_settings(EstimatorSettings, {'tof': {'floor': 1.0, 'gate': 1.0}})
 
 
 def described(tolerances: dict | None = None, **changes) -> RobotDescription:
@@ -118,7 +119,8 @@ def test_the_border_is_the_derivative_of_the_cost(kind):
     """
     Describe the robot a little otherwise, and the cost changes by the gradient.
 
-    Weights are held while linearising, and those of ranges and trackers change a little too.
+    Weights are held while linearising: noise across the surface hides that of ranges, which hangs
+    on the incidence.
     """
     mount = {'xyz': [0.01, 0.0, 0.005], 'rpy_deg': [10.0, 20.0, 5.0]}
     robot = described(trackers=[{'name': 'coil', 'ring': 'r2', 'mount': mount}])
@@ -129,7 +131,7 @@ def test_the_border_is_the_derivative_of_the_cost(kind):
 
     def cost(theta: np.ndarray, border: Border | None = None) -> float:
         changed = parameters.applied(theta)
-        setup = Setup(changed, grid, EstimatorSettings(), room_map(0.05))
+        setup = Setup(changed, grid, FLAT, room_map(0.05))
         factor = next(one for one in FACTORS if one.consumes is kind)(setup)
         corrections, total = Corrections(changed), 0.0
         batch = factor.stack(
@@ -153,7 +155,7 @@ def test_the_border_is_the_derivative_of_the_cost(kind):
             slope = (cost(step) - cost(-step)) / (2e-3 * block.sigma[i])
             expected = border.g[block.at.start + i]
             scale = 1e-3 * np.abs(border.g[block.at]).max() + 1e-6
-            assert slope == pytest.approx(expected, rel=0.1, abs=scale), (block.name, part)
+            assert slope == pytest.approx(expected, rel=1e-2, abs=scale), (block.name, part)
 
 
 def mount_of(robot: RobotDescription) -> np.ndarray:
@@ -215,12 +217,12 @@ def test_carrying_the_border_on_is_the_elimination_of_all_columns_at_once():
     constants = np.arange(K * D, size)
     parts = []
     for k in range(K - 1):
-        H, e = add(np.concatenate([np.arange(D * k, D * (k + 2)), constants]))
-        x = slice(2 * D)
+        H, e = add(np.concatenate([D * k + np.arange(2 * D), constants]))
+        x, theta = slice(2 * D), slice(2 * D, 2 * D + P)
         parts.append(
             (
                 Normal(np.triu(H[x, x]), e[x]),
-                Border(H[x, 2 * D :], H[2 * D :, 2 * D :], e[2 * D :]),
+                Border(H[x, theta], H[theta, theta], e[theta]),
             )
         )
     for normal, border in parts:

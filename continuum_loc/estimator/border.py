@@ -60,6 +60,8 @@ class Border(NamedTuple):
         equations, is what they miss: the motion's prior resists a shift of a motion as it would
         resist that motion once more.
         """
+        if not len(columns):
+            return
         for part in (self.C, self.H, self.H.T, self.g[None]):
             part[:, columns] -= part[:, columns].mean(axis=1, keepdims=True)
 

@@ -81,18 +81,14 @@ class Calibrator:
         past, start = chain.border, chain.marginals[0]
         W = cho_solve(cho_factor(symmetric(start.H)), past.C)
         H, g = past.H - past.C.T @ W, past.g - start.g @ W
-        self._known, self._sensitivity = (H, g), W
+        self._sensitivity = W
+        if not self._settings.online:
+            return None
+        self._known = H, g
         self.covariance = np.linalg.inv(H)
-        step = self._centred(-self.covariance @ g)
+        step = self.parameters.centred(self.theta, -self.covariance @ g)
         notable = np.abs(step) > NOTABLE * np.sqrt(np.diag(self.covariance))
         return step if notable.any() else None
-
-    def _centred(self, step: np.ndarray) -> np.ndarray:
-        """Choose of all steps that tell the same the one that leaves most clocks right."""
-        clocks = self.parameters.clocks
-        if len(clocks):
-            step[clocks] -= np.median((self.theta + step)[clocks])
-        return step
 
     def _wander(self, at: np.ndarray, variance: np.ndarray) -> None:
         """

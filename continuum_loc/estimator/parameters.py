@@ -17,7 +17,7 @@ They come in blocks of one kind and name. Each says how far it may be off by the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ class Block(NamedTuple):
 
 class Parameters:
     """
-    Blocks of a robot, those of the `kinds` asked for.
+    Blocks of a robot, those of the `kinds` asked for, but for sensors that are `exact`.
 
     size: P; sigma: (P,) 1 sigma beforehand; middle: (3,) that the map turns about [m].
     """
@@ -60,8 +60,9 @@ class Parameters:
         robot: RobotDescription,
         kinds: Sequence[str] = KINDS,
         middle: np.ndarray | None = None,
+        exact: Collection[str] = (),
     ):
-        self.robot, self._kinds = robot, tuple(kinds)
+        self.robot, self._kinds, self._exact = robot, tuple(kinds), frozenset(exact)
         self.middle = np.zeros(3) if middle is None else np.asarray(middle, float)
         self.boards = {one.name: f'board {one.ring}' for one in (*robot.tof, *robot.imu)}
         self.boards |= {one.name: one.name for one in robot.trackers}
@@ -70,7 +71,8 @@ class Parameters:
         self.blocks: list[Block] = []
         self._places: dict[tuple[str, str], slice] = {}
         for kind, name, sigma in _possible(robot, self.boards):
-            if kind in kinds and (kind, name) not in self._places and np.all(sigma > 0.0):
+            known = name in exact or (kind, name) in self._places
+            if kind in kinds and not known and np.all(sigma > 0.0):
                 at = slice(self.size, self.size + len(sigma))
                 self.blocks.append(Block(kind, name, at, sigma))
                 self._places[kind, name] = at
@@ -113,7 +115,7 @@ class Parameters:
 
     def at(self, theta: np.ndarray) -> Parameters:
         """Count the same constants from the robot as it is with theta (P,)."""
-        return Parameters(self.applied(theta), self._kinds, self.middle)
+        return Parameters(self.applied(theta), self._kinds, self.middle, self._exact)
 
     def applied(self, theta: np.ndarray) -> RobotDescription:
         """Describe the robot as it is with theta (P,), but for the map."""
@@ -143,6 +145,12 @@ class Parameters:
             columns = self.columns(kind, [name])[0]
             out[columns[columns >= 0]] = 1.0
         return out
+
+    def centred(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Choose of all steps (P,) that tell the same the one that leaves most clocks right."""
+        if len(self.clocks):
+            step[self.clocks] -= np.median((theta + step)[self.clocks])
+        return step
 
     def T_map_moved(self, theta: np.ndarray) -> np.ndarray:
         """(4, 4) by which the prior map is to be moved."""

@@ -320,7 +320,14 @@ class DoubtSettings(Settings):
 class CalibrationSettings(Settings):
     """Estimating what the robot departs from its description by, within its tolerances."""
 
-    enabled: bool = Field(True, description='whether constants of the robot are estimated')
+    enabled: bool = Field(
+        True, description='whether constants of the robot are taken for uncertain at all'
+    )
+    online: bool = Field(
+        True,
+        description='whether they are estimated while it moves; else they only spread the '
+        'covariance, as befits a robot that was calibrated',
+    )
     period: float = Field(
         1.0, gt=0.0, description='time between two changes of what measurements are taken for [s]'
     )
