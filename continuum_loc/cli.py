@@ -19,6 +19,7 @@ import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
 from continuum_loc.errors import (
+    CalibrationError,
     ContinuumLocError,
     InputError,
     MapError,
@@ -454,6 +455,55 @@ def identify(
     for finding in found.findings:
         console.print(finding, highlight=False, soft_wrap=True)
     console.print(f'written {out}')
+
+
+@app.command()
+def calibrate(
+    bags: Annotated[list[Path], typer.Argument(help='bags of one robot in one place')],
+    out: Annotated[Path, typer.Option(help='description to write (YAML)')],
+    robot: Robot = 'engine',
+    map_file: Annotated[Path | None, typer.Option('--map', help='prior map')] = None,
+    settings: Annotated[str, typer.Option(help="estimator's, by name or file")] = '',
+    reference: Annotated[
+        str, typer.Option(help='what tells where the rings were: none, tracker or truth')
+    ] = 'none',
+) -> None:
+    """
+    Find what a robot departs from its description by: mounts, ranges, gyros, clocks, base.
+
+    The description's `tolerances` say how far each may be off. Writes a new description, the
+    covariance that is left, and a report that says what the bags do not show.
+
+    Example: `continuum-loc calibrate runs/a --robot mine.yaml --map cell.npz --out found.yaml`
+    """
+    from continuum_loc.estimator.settings import settings_of
+    from continuum_loc.mapping.map_files import load_map
+    from continuum_loc.offline.calibrated import calibrate_bags, write_calibration
+    from continuum_loc.robot import load_robot
+
+    description = load_robot(robot)
+    if description.tof and map_file is None:
+        raise CalibrationError(
+            f"robot '{description.name}' has ToF sensors, which tell nothing without a map: "
+            'give the one of this place with --map'
+        )
+    chosen = settings_of(description.name, settings or None)
+    with _busy() as status:
+        found = calibrate_bags(
+            description,
+            load_map(map_file) if map_file else None,
+            bags,
+            chosen,
+            reference,
+            lambda doing, done: status.update(f'{doing}: {done:.1f}'),
+        )
+    said = 'converged' if found.converged else 'not converged'
+    console.print(
+        f'{len(found.theta)} constants, {len(found.unseen())} of them hardly told; {said}',
+        highlight=False,
+    )
+    for path in write_calibration(found, chosen.calibration.least, out):
+        console.print(f'written {path}', highlight=False, soft_wrap=True)
 
 
 def _tell_sweep(start: Trying, best: Trying) -> None:

@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 from continuum_loc import lie
+from continuum_loc.calibration.batch import calibrate
 from continuum_loc.corrections import Corrections
+from continuum_loc.errors import CalibrationError
 from continuum_loc.estimator import EstimatorSettings, SlidingWindowFilter
 from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.chain import Chain
@@ -20,6 +22,7 @@ from continuum_loc.measurements import (
     TrackedPose,
     TruthSample,
 )
+from continuum_loc.offline.calibrated import told
 from continuum_loc.offline.metrics import errors
 from continuum_loc.robot import mounted, RobotDescription, Tolerances
 from continuum_loc.settings import parse_settings
@@ -313,3 +316,39 @@ def test_a_late_board_is_named_and_nobody_else():
     assert set(named) == late
     assert all(reason.endswith('ms late') for reason in named.values())
     assert -0.065 < filter_.setup.robot.tof[-1].clock < -0.03
+
+
+# ------------------------------------------------------------------- found from a recording
+
+
+def test_a_recording_with_truth_tells_mounts_and_ranges():
+    """Mounts 2 mm and 1 deg off are found to 1 mm and 0.2 deg: root mean squares over sensors."""
+    robot = described({'mount_position': 0.002, 'mount_rotation_deg': 1.0})
+    true_robot = truly(robot, 5)
+    settings = parse_settings(EstimatorSettings, {'knot_period': 0.1, 'window': 0.6, 'lag': 0.2})
+    recording = list(stream(Rod(true_robot, seed=5), 4.0, 5))
+    found = calibrate(robot, room_map(), [recording], settings, 'truth')
+    off = np.array(
+        [
+            lie.log(lie.inverse(one.mount.T_ring_sensor) @ other.mount.T_ring_sensor)
+            for one, other in zip(found.robot.tof, true_robot.tof, strict=True)
+        ]
+    )
+    assert found.converged
+    assert np.sqrt(np.mean(off[:, :3] ** 2)) < 1e-3
+    assert np.degrees(np.sqrt(np.mean(off[:, 3:] ** 2))) < 0.2
+    assert found.robot.trackers == robot.trackers
+    assert '| r1_tof0 mount x | 0 +- 2.00 mm |' in told(found)
+
+
+@pytest.mark.parametrize(
+    ('reference', 'said'), [('moon', 'valid are'), ('tracker', 'has no tracker')]
+)
+def test_a_reference_that_is_not_there_is_refused(reference, said):
+    with pytest.raises(CalibrationError, match=said):
+        calibrate(described(), None, [[]], EstimatorSettings(), reference)
+
+
+def test_an_exact_robot_cannot_be_calibrated():
+    with pytest.raises(CalibrationError, match='exactly as described'):
+        calibrate(rod(), None, [[]], EstimatorSettings())

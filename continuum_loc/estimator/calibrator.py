@@ -43,7 +43,7 @@ class Calibrator:
         self.parameters, self._window, self._settings = parameters, window, settings
         self.theta = np.zeros(parameters.size)
         self.covariance = np.diag(np.square(parameters.sigma))
-        self._floor = np.square(settings.least * parameters.sigma)
+        self._floor = np.square(float(settings.online) * settings.least * parameters.sigma)
         self._known = np.diag(parameters.sigma**-2.0), np.zeros(parameters.size)
         self._sensitivity: np.ndarray | None = None
         self._lateness = {name: parameters.lateness(name) for name in parameters.boards}

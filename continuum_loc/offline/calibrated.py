@@ -57,20 +57,26 @@ def calibrate_bags(
     return calibrate(robot, prior_map, streams, settings, reference, progress)
 
 
-def tolerances_left(found: Calibration) -> Tolerances:
-    """Say how far a calibrated robot may still be off: root mean squares over its parts."""
+def tolerances_left(found: Calibration, least: float) -> Tolerances:
+    """
+    Say how far a calibrated robot may still be off: root mean squares over its parts.
+
+    least: share of its tolerance that is left of each at any rate, as what the model misses does
+    not average out.
+    """
     left = found.robot.tolerances.model_dump()
     for kind, tolerances in TOLERANCES.items():
         sigmas = [found.sigma[one.at] for one in found.parameters.blocks if one.kind == kind]
         for name, part, unit in tolerances if sigmas else ():
             rms = float(np.sqrt(np.mean(np.square(np.array(sigmas)[:, part]))))
-            left[name] = float(np.degrees(rms)) if unit == 'deg' else rms
+            rms = float(np.degrees(rms)) if unit == 'deg' else rms
+            left[name] = min(float(np.hypot(rms, least * left[name])), left[name])
     return Tolerances(**left)
 
 
-def write_calibration(found: Calibration, out: Path) -> list[Path]:
+def write_calibration(found: Calibration, least: float, out: Path) -> list[Path]:
     """Write the description, the whole covariance (`.npz`) and a report (`.md`); their paths."""
-    robot = found.robot.model_copy(update={'tolerances': tolerances_left(found)})
+    robot = found.robot.model_copy(update={'tolerances': tolerances_left(found, least)})
     covariance, report = out.with_suffix('.calibration.npz'), out.with_suffix('.calibration.md')
     dump_settings(robot, out)
     with covariance.open('wb') as stream:

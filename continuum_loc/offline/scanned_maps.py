@@ -74,8 +74,21 @@ def _scan(prior: PriorMap, scan: Scan, rng: np.random.Generator) -> PriorMap:
     )
 
 
+def T_map_scene(prior: PriorMap, departures: Departures, seed: int) -> np.ndarray:
+    """(4, 4) from the scene's frame to that of the map that is made of it, `prior` being exact."""
+    if not departures.map_frame:
+        return np.eye(4)
+    if departures.scan:
+        prior = _scan(prior, departures.scan, stream_of(seed, 'scan'))
+    return _about_middle(prior, departures.map_frame.drawn(stream_of(seed, 'map_frame')))
+
+
 def _moved(prior: PriorMap, T: np.ndarray) -> PriorMap:
     """Turn the map about its middle, and shift it."""
+    return prior.moved(_about_middle(prior, T))
+
+
+def _about_middle(prior: PriorMap, T: np.ndarray) -> np.ndarray:
     middle = np.eye(4)
     middle[:3, 3] = prior.points.mean(axis=0)
-    return prior.moved(middle @ T @ lie.inverse(middle))
+    return middle @ T @ lie.inverse(middle)
