@@ -172,6 +172,11 @@ class Base(Settings):
     )
     insertion: Insertion = Insertion()
     measurement: BaseMeasurement = BaseMeasurement()
+    region: tuple[float, float] = Field(
+        (0.0, 0.0),
+        description='how far from there a free base may begin [m, deg]; with (0, 0) it begins '
+        'there, and 180 deg and a way that is longer than the map leave it anywhere in it',
+    )
     speed: tuple[float, float] = Field(
         (0.3, 0.5), description='how fast a carried base moves and turns, 1 sigma [m/s, rad/s]'
     )
@@ -179,6 +184,13 @@ class Base(Settings):
         (0.01, 0.03),
         description='white noise on the acceleration of a carried base [m^2/s^3, rad^2/s^3]',
     )
+
+    @field_validator('region')
+    @classmethod
+    def _not_negative(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if min(value) < 0.0:
+            raise ValueError('both must be 0 or greater')
+        return value
 
     @field_validator('speed', 'acceleration')
     @classmethod

@@ -29,6 +29,7 @@ from continuum_loc.estimator.recovery import Recovery
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.solver import track
+from continuum_loc.estimator.start import Start
 from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import Measurement, nanoseconds, seconds
@@ -83,6 +84,7 @@ class SlidingWindowFilter:
         self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
         tendons = next((one for one in self.factors if isinstance(one, MechanicsFactor)), None)
         self._loads = Loads(self.setup, self.window, tendons) if tendons else None
+        self.start = Start(self.setup, self.window, self.factors)
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle = Cycle(self.factors, self.settings.output_rate)
 
@@ -165,6 +167,7 @@ class SlidingWindowFilter:
             self._rest.note(measurement)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
         self.doubts.note(measurement, time, any(used))
+        self.start.note(measurement)
         return any(used)
 
     def _consumers(self, kind: type) -> list[Factor]:
@@ -204,7 +207,19 @@ class SlidingWindowFilter:
         with self._threads.limit(limits=1, user_api='blas'):
             # Small matrices: more threads only wait for one another.
             time = seconds(output, self.epoch)
-            return self._estimate(time, self._solve(time), started)
+            if self.start.pending and not self.recovery.acquired:
+                return self._locate(time)
+            outcome = self._solve(time)
+            told = not self.start.pending
+            self.start.watch(time, self.recovery.worst_share())
+            if told and self.start.pending:
+                self.recovery.lose()  # this last estimate says so
+            return self._estimate(time, outcome, started) if told else None
+
+    def _locate(self, time: float) -> None:
+        """Look for the base, and tell nothing."""
+        if self.start.due(time):
+            self.start.tried(time, *self.recovery.locate(self.start.bodies()))
 
     def _solve(self, time: float) -> tuple[int, bool]:
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
@@ -256,7 +271,7 @@ class SlidingWindowFilter:
 
     def _status(self) -> Status:
         """Say what to tell of the body; nothing but an undisputed fit is tracking."""
-        status = self.recovery.status
+        status = 'lost' if self.start.astray else self.recovery.status
         return 'doubtful' if status == 'tracking' and self.doubts.reasons else status
 
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:

@@ -8,12 +8,18 @@ import sys
 import time
 from typing import Any
 
-from continuum_loc.errors import MessageError
+from continuum_loc.errors import FrameError, MessageError
 from continuum_loc.estimate import Estimate
 from continuum_loc.estimator import EstimatorSettings, settings_of, SlidingWindowFilter
 from continuum_loc.estimator.settings import PRESETS_FOLDER
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.measurements import EncoderSample, Measurement, nanoseconds, TofFrame
+from continuum_loc.measurements import (
+    BaseSample,
+    EncoderSample,
+    Measurement,
+    nanoseconds,
+    TofFrame,
+)
 from continuum_loc.nodes.support import parameters
 from continuum_loc.nodes.support.body import body_message, ring_records, ring_topics
 from continuum_loc.nodes.support.frames import FrameTree
@@ -33,7 +39,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from msg_tools.convert import tracked_pose
 from msg_tools.factory import ros_messages
 from msg_tools.geometry import MAP
-from msg_tools.records import CloudRecord
+from msg_tools.records import CloudRecord, PosesRecord
 from msg_tools.results import columns_message, map_record, tip_message
 from msg_tools.topics import INPUTS, tip_of, TRACKER
 import numpy as np
@@ -65,6 +71,8 @@ class EstimatorNode(WorkerNode):
         self.body: Any = None
         self._insertion = 0.0
         self._scene_published = 0
+        self._told_base = 0  # stamp of the newest pose of the base that was taken from /tf
+        self._hypotheses: Any = None
 
     # ------------------------------------------------ life
 
@@ -83,6 +91,13 @@ class EstimatorNode(WorkerNode):
                 'no TF: tf2_msgs is not installed (apt install ros-jazzy-tf2-msgs)'
             )
         topics = ('poses', 'backbone', 'tip', 'reconstruction', *ring_topics(self.robot))
+        base = self.robot.base
+        if base.mode == 'measured':
+            topics += ('base/frame', *(['base/pose'] if self.settings.base_tf else []))
+        if base.mode == 'free' and base.region[0] > 0.0:
+            topics += ('base/hypotheses',)
+        if self.robot.actuation is not None:
+            topics += ('load',)
         for topic in topics:
             self.publisher(topic)
         markers = ros_messages().resolve('visualization_msgs/msg/MarkerArray')
@@ -95,6 +110,8 @@ class EstimatorNode(WorkerNode):
             self.tf.send_fixed()
             listen_to_frames(self, self.tree)
         super().activate()
+        if self.settings.base_tf:
+            self.every(1.0 / self.robot.base.measurement.rate, self._tell_base)
 
     # ------------------------------------------------ the filter (worker thread)
 
@@ -105,10 +122,32 @@ class EstimatorNode(WorkerNode):
         if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
             self._insertion = float(measurement.position[measurement.names.index('insertion')])
         estimate = self.filter.process(measurement)
+        self._publish_hypotheses(measurement.stamp)
         if estimate is None:
             return None
         self._publish(estimate)
         return estimate.stamp
+
+    def _tell_base(self) -> None:
+        """Put what /tf newly says of the base onto `base/pose`, where it is heard and recorded."""
+        frame, carrier = self.robot.base.measurement.frame, self.settings.base_tf
+        stamp = self.tree.latest(frame, carrier)
+        if stamp is None or stamp <= self._told_base:
+            return
+        try:
+            T_frame_base = self.tree.transform(frame, carrier, stamp)
+        except FrameError as error:
+            self.get_logger().warning(f'base_tf: {error}', throttle_duration_sec=10.0)
+            return
+        self._told_base = stamp
+        self.publish('base/pose', BaseSample(stamp, frame, T_frame_base))
+
+    def _publish_hypotheses(self, stamp: int) -> None:
+        """Publish where the base may be, whenever a search has found other places."""
+        found = self.filter.start.hypotheses
+        if found is not self._hypotheses and len(found):
+            self.publish('base/hypotheses', PosesRecord(stamp, found))
+        self._hypotheses = found
 
     def idle(self) -> bool:
         """Place what the ToF sensors saw an instant ago, and publish it when it is due."""
@@ -130,7 +169,9 @@ class EstimatorNode(WorkerNode):
         """Lost and doubtful are errors; starting, suspects, what nothing observes are warnings."""
         estimate = self.estimate
         if estimate is None:
-            return WARN, 'no estimate yet', {}
+            places = len(self.filter.start.hypotheses) if self.filter is not None else 0
+            looked = f': {places} places fit, move on' if places > 1 else ''
+            return WARN, f'no estimate yet{looked}', {}
         inliers = (
             float(np.mean(list(estimate.inliers.values()))) if estimate.inliers else float('nan')
         )
@@ -184,6 +225,8 @@ class EstimatorNode(WorkerNode):
         self.publish('backbone', estimate)
         if estimate.T_map_frame is not None:
             self.publish('base/frame', estimate)
+        if self.robot.actuation is not None:
+            self.publish('load', estimate)
         if self.tf is not None:
             self.tf.send(estimate.stamp, estimate.T_map_ring, estimate.T_map_frame)
         self.recent.add(estimate)

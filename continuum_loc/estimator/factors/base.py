@@ -22,6 +22,7 @@ from continuum_loc.estimator.matching import Surface, surface_of
 from continuum_loc.estimator.normal import Normal
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
+from continuum_loc.mapping.distances import DistanceField
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.robot import RobotDescription
 import numpy as np
@@ -29,12 +30,16 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What factors are made from; the map's lookup and surface are made once, when asked for."""
+    """What factors are made from; the map's surface and distances are made once, when asked."""
 
     robot: RobotDescription
     grid: Grid
     settings: EstimatorSettings
     prior_map: PriorMap | None = None
+
+    @cached_property
+    def distances(self) -> DistanceField:
+        return DistanceField.of(self.prior_map)
 
     @cached_property
     def surface(self) -> Surface:
