@@ -99,8 +99,9 @@ class Loads:
         by_last = np.einsum('nij,n->nij', lie.right_jacobian_inverse(twist * h[:, None]), 1.0 / h)
         by_first = -by_last @ lie.adjoint(lie.exp(-twist * h[:, None]))
         for n in range(len(h)):
-            J[n, :, NODE_DIM * n : NODE_DIM * n + 6] = by_first[n, STRAINS]
-            J[n, :, NODE_DIM * (n + 1) : NODE_DIM * (n + 1) + 6] = by_last[n, STRAINS]
+            first, last = NODE_DIM * n, NODE_DIM * n + NODE_DIM
+            J[n][:, first:][:, :6] = by_first[n, STRAINS]
+            J[n][:, last:][:, :6] = by_last[n, STRAINS]
         J = J.reshape(-1, self._grid.dim)
         return self._window.chain.covariance(k, (1.0 - u) * J, u * J)
 
@@ -149,7 +150,8 @@ def _place(s: np.ndarray, gains: np.ndarray) -> tuple[float, float]:
         m = 1 if n == 0 else n - 1
         slope = abs(gains[n] - gains[m]) / abs(s[n] - s[m])
         return float(s[n]), float(1.0 / max(slope, 1e-9))
-    fit = np.polyfit(s[n - 1 : n + 2] - s[n], gains[n - 1 : n + 2], 2)
+    around = slice(n - 1, n + 2)
+    fit = np.polyfit(s[around] - s[n], gains[around], 2)
     top = s[n] - fit[1] / (2.0 * fit[0]) if fit[0] < 0.0 else s[n]
     # The gain is twice the logarithm of the likelihood.
     spread = 1.0 / np.sqrt(max(-fit[0], 1e-9))
