@@ -18,9 +18,11 @@ from continuum_loc.estimate import Estimate, Status
 from continuum_loc.estimator.cycle import Cycle
 from continuum_loc.estimator.doubts import Doubts
 from continuum_loc.estimator.factors import Factor, FACTORS, Guess, Setup
+from continuum_loc.estimator.factors.mechanics import MechanicsFactor
 from continuum_loc.estimator.fit import Fit, fit_of, rattle
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.interpolation import backbone, BodyState, rattle_covariance
+from continuum_loc.estimator.loads import Loads
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
 from continuum_loc.estimator.recovery import Recovery
@@ -80,6 +82,8 @@ class SlidingWindowFilter:
             self.robot, self.window, self.factors, self.health, self.settings.recovery
         )
         self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
+        tendons = next((one for one in self.factors if isinstance(one, MechanicsFactor)), None)
+        self._loads = Loads(self.setup, self.window, tendons) if tendons else None
         self.start = Start(self.setup, self.window, self.factors)
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle = Cycle(self.factors, self.settings.output_rate)
@@ -261,6 +265,8 @@ class SlidingWindowFilter:
         before, lagged, fit = now - self.settings.lag, None, fit_of(self.window.intervals)
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
             lagged = self._compose(before, fit, outcome, started)
+        if self._loads is not None:
+            self._loads.look(now)
         return self._compose(now, fit, outcome, started, lagged)
 
     def _status(self) -> Status:
@@ -316,4 +322,5 @@ class SlidingWindowFilter:
             lagged=lagged,
             T_map_frame=T_map_frame,
             frame_covariance=frame_covariance,
+            loads=self._loads.found if self._loads is not None else (),
         )

@@ -96,6 +96,8 @@ class EstimatorNode(WorkerNode):
             topics += ('base/frame', *(['base/pose'] if self.settings.base_tf else []))
         if base.mode == 'free' and base.region[0] > 0.0:
             topics += ('base/hypotheses',)
+        if self.robot.actuation is not None:
+            topics += ('load',)
         for topic in topics:
             self.publisher(topic)
         markers = ros_messages().resolve('visualization_msgs/msg/MarkerArray')
@@ -223,6 +225,8 @@ class EstimatorNode(WorkerNode):
         self.publish('backbone', estimate)
         if estimate.T_map_frame is not None:
             self.publish('base/frame', estimate)
+        if self.robot.actuation is not None:
+            self.publish('load', estimate)
         if self.tf is not None:
             self.tf.send(estimate.stamp, estimate.T_map_ring, estimate.T_map_frame)
         self.recent.add(estimate)
