@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 import json
+import os
 from pathlib import Path
 import shutil
 import sys
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from continuum_loc.offline.tune import Trying
 
 OK, FAILED, USAGE = 0, 1, 2
+CORES = len(os.sched_getaffinity(0))  # that this process may use
 
 app = typer.Typer(
     name='continuum-loc',
@@ -566,7 +568,7 @@ def evaluate(
         Path | None, typer.Option(help='folder of the results; default: a new run')
     ] = None,
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option(help='processes', min=1)] = 1,
+    jobs: Annotated[int, typer.Option(help='processes; one for each core', min=1)] = CORES,
     minutes: Annotated[
         float | None, typer.Option(help='with `soak`: how long, instead of half an hour', min=0.5)
     ] = None,
@@ -574,9 +576,7 @@ def evaluate(
         list[str] | None,
         typer.Option('--world', help='`ideal` or `disturbed` alone; studies print both'),
     ] = None,
-    scheduler: Annotated[
-        str, typer.Option(help='address of a Dask scheduler to run the trials on')
-    ] = '',
+    scheduler: Annotated[str, typer.Option(help='Dask scheduler that runs the trials')] = '',
     robot: Annotated[str, typer.Option(help='with `bags`: the robot')] = 'engine',
     map_file: Annotated[
         Path | None, typer.Option('--map', help='with `bags`: the prior map')
@@ -590,7 +590,7 @@ def evaluate(
 
     An interrupted study continues where it stopped when its `--out` is given again.
 
-    Example: `continuum-loc evaluate table2 --quick --jobs 2`, `continuum-loc evaluate bags my_bags
+    Example: `continuum-loc evaluate table2 --quick`, `continuum-loc evaluate bags my_bags
     --map my_map.npz`
     """
     from continuum_loc.offline.parallel import SCHEDULER

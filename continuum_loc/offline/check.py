@@ -185,7 +185,8 @@ def _of_estimates(
     if not estimates:
         yield Finding('error', 'estimate', 'no estimate came of it')
         return
-    half = estimates[len(estimates) // 2 :]  # the start settles
+    middle = len(estimates) // 2
+    half = estimates[middle:]  # the start settles
     fine = True
     for finding in (*_misfits(half), *_disbelieved(half), *_verdict(half)):
         fine = False
