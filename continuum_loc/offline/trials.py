@@ -39,6 +39,16 @@ BASES: dict[str, dict[str, Any]] = {
         'mode': 'measured',
         'sigma_position': 0.001,
         'sigma_rotation_deg': 0.2,
+        'measurement': {
+            'sigma_position': 0.0002,
+            'sigma_rotation_deg': 0.02,
+            'latency': 0.010,
+        },
+    },
+    'untold latency': {
+        'mode': 'measured',
+        'sigma_position': 0.001,
+        'sigma_rotation_deg': 0.2,
         'measurement': {'sigma_position': 0.0002, 'sigma_rotation_deg': 0.02},
     },
     'odometry': {
@@ -124,7 +134,7 @@ class Trial:
     @property
     def name(self) -> str:
         """Name the trial, uniquely among trials."""
-        base = f'-base_{self.base}' * bool(self.base)
+        base = f'-base_{self.base}'.replace(' ', '_') * bool(self.base)
         return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}{base}'
 
     @property
