@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from operator import itemgetter
 import time as clock
 
@@ -32,6 +33,7 @@ from continuum_loc.estimator.solver import track
 from continuum_loc.estimator.start import Start
 from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
 from continuum_loc.estimator.window import Window
+from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.measurements import Measurement, nanoseconds, seconds
 from continuum_loc.robot import RobotDescription
 import numpy as np
@@ -77,16 +79,47 @@ class SlidingWindowFilter:
         self._needed = {one.needed() for one in self.factors if one.needed()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
-        self.health = Health(self.robot, self.window, self.factors, self.settings.health)
-        self.recovery = Recovery(
-            self.robot, self.window, self.factors, self.health, self.settings.recovery
-        )
-        self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
+        self._watch()
         tendons = next((one for one in self.factors if isinstance(one, MechanicsFactor)), None)
         self._loads = Loads(self.setup, self.window, tendons) if tendons else None
         self.start = Start(self.setup, self.window, self.factors)
         self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
         self._cycle = Cycle(self.factors, self.settings.output_rate)
+
+    def forget_faults(self) -> None:
+        """Believe every sensor again, until it is found out anew; the body stays."""
+        acquired = self.recovery.acquired
+        for factor in self.factors:
+            factor.weigh((), 1.0)
+        self._watch()
+        self.recovery.acquired = acquired
+        for interval in self.window.intervals:
+            interval.changed = True
+
+    def use_map(self, prior_map: PriorMap) -> None:
+        """
+        Match to another map from now on; the body and its biases stay, faults are forgotten.
+
+        What was measured in the window is matched anew. A filter that had no map starts anew, and
+        so does one whose base is searched for, since it is in the map that it is.
+        """
+        anew = self.setup.prior_map is None or self.start.wanted
+        self.setup = replace(self.setup, prior_map=prior_map)
+        if anew:
+            self.reset()
+            return
+        for factor in self.factors:
+            rows = [row for interval in self.window.intervals for row in interval.rows(factor)]
+            factor.use_map(self.setup, rows)
+        self.forget_faults()
+
+    def _watch(self) -> None:
+        """Make those who watch how well it fits, without a past."""
+        self.health = Health(self.robot, self.window, self.factors, self.settings.health)
+        self.recovery = Recovery(
+            self.robot, self.window, self.factors, self.health, self.settings.recovery
+        )
+        self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
 
     # -------------------------------------------------------------- measurements in, estimates out
 
