@@ -167,6 +167,15 @@ def simulate(
             '`disturbed:mounts+base` takes parts alone',
         ),
     ] = 'ideal',
+    carried: Annotated[
+        str,
+        typer.Option(
+            help='what carries the base: `smooth`, `brisk`, `stops`, `wrist`, or your own (YAML)'
+        ),
+    ] = '',
+    told: Annotated[
+        str, typer.Option(help='how that tells where the base is: `arm` or `odometry`')
+    ] = 'arm',
     duration: Annotated[
         float | None, typer.Option(help='seconds; default: the whole trajectory')
     ] = None,
@@ -190,6 +199,8 @@ def simulate(
         seed=seed,
         duration=duration,
         world=world_name,
+        carried=carried,
+        told=told,
     )
     with _busy() as status:
         status.update('building the scene and letting the robot come to rest')
