@@ -122,6 +122,9 @@ TOPICS: dict[str, Topic] = {
     ),
     'base/hypotheses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(results.poses_record)),
     'base/frame': Topic(_POSE, results.frame_message, _read(results.frame_record)),
+    'load': Topic(
+        'geometry_msgs/msg/WrenchStamped', results.load_message, _read(results.load_record)
+    ),
     RING_POSE: Topic(_POSE, convert.tracker_message, _pose_of_one),
     RING_TWIST: Topic(
         'geometry_msgs/msg/TwistWithCovarianceStamped',
@@ -162,6 +165,7 @@ OUTPUTS = (
     'tip',
     'base/frame',
     'base/hypotheses',
+    'load',
     RING_POSE,
     RING_TWIST,
     'reconstruction',

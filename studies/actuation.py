@@ -29,6 +29,7 @@ from studies._filter_runs import Case, CaseResult, failures, run_cases
 from studies._pages import write_page
 from studies.ablation import NO_GYRO, NO_STRAIN, NO_TOF
 from studies.support.actuated import ARM, REAL, real_robot, simulated_robot
+from studies.support.pushed import Found, pushed
 from studies.support.static_shapes import cosserat_errors, sorosim_errors
 from studies.support.worlds import by_world, column, in_worlds, told
 
@@ -42,6 +43,14 @@ UNSEEN = tuple(
 )
 # Bounds: tip RMSE [mm] of the fit, and of patterns held out.
 BOUNDS = {'v4': (8.5, 9.5), 'v6': (11.0, 13.0)}
+
+# Robot, trajectory, where it is pushed [m] and how hard [N]; in free space, without ToF.
+PUSHES = (
+    ('engine', 't3', 1.5, 0.5),
+    ('engine', 't3', 1.5, 1.0),
+    ('engine', 't3', 1.2, 1.0),
+    ('engine', 't3', 0.9, 2.0),
+)
 
 VARIANTS: dict[str, dict[str, Any]] = {
     'tendons alone': NO_TOF | NO_GYRO | NO_STRAIN,
@@ -68,19 +77,26 @@ def run(out: Path, quick: bool, seed: int, jobs: int) -> list[Claim]:
     claims, shapes = statics(data_folder())
     found = {} if quick else identified(data_folder())
     claims += real_claims(found)
+    pushes = [pushed(*push, seed + k) for k, push in enumerate(PUSHES[:1] if quick else PUSHES)]
+    claims += load_claims(pushes)
     results = run_cases(cases(out, quick, seed), out, jobs)
     rows: list[dict[str, Any]] = []
     for world, members in by_world(results, lambda one: one.case.trial).items():
         claims += told(judge(members), world)
         rows += column([row(one) for one in members if one.run], world)
-    tables = {'statics': shapes, 'real_robots': real_rows(found), 'ablation': rows}
+    tables = {
+        'statics': shapes,
+        'real_robots': real_rows(found),
+        'ablation': rows,
+        'loads': [one.row() for one in pushes],
+    }
     for name, one in found.items():
         dump_settings(one.robot, out / f'{name}.yaml')
     extra = {'quick': quick, 'failed': failures(results), 'without': missing(data_folder())}
     write_study(
         out, claims, seed=seed, settings={'variants': VARIANTS}, tables=tables, extra=extra
     )
-    titles = ('Statics', 'Real robots', 'What tendons are worth')
+    titles = ('Statics', 'Real robots', 'What tendons are worth', 'Forces in free space')
     pages = dict(zip(titles, tables.values(), strict=True))
     write_page(out, 'Actuation', TEXT, claims, pages)
     return claims
@@ -139,6 +155,16 @@ def real_claims(found: dict[str, Identified]) -> list[Claim]:
             between(f'{name}: NEES/dof, patterns held out', nees, '', 0.7, 1.5),
         ]
     return claims
+
+
+def load_claims(pushes: Sequence[Found]) -> list[Claim]:
+    """Bounds of the forces that are told: the worst of all pushes."""
+    return [
+        at_most('loads: told in free space', sum(one.false for one in pushes), 'estimates', 0),
+        at_most('loads: found after', max(one.after for one in pushes), 's', 0.3),
+        at_most('loads: error of size', 100.0 * max(one.size for one in pushes), '%', 20.0),
+        at_most('loads: error of place', 100.0 * max(one.place for one in pushes), 'cm', 5.0),
+    ]
 
 
 def real_rows(found: dict[str, Identified]) -> list[dict[str, Any]]:

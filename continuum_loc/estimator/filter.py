@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from operator import itemgetter
 import time as clock
 
@@ -21,9 +22,11 @@ from continuum_loc.estimator.calibrator import Calibrator
 from continuum_loc.estimator.cycle import Cycle
 from continuum_loc.estimator.doubts import Doubts
 from continuum_loc.estimator.factors import Factor, FACTORS, Guess, Setup
+from continuum_loc.estimator.factors.mechanics import MechanicsFactor
 from continuum_loc.estimator.fit import Fit, fit_of, rattle
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.interpolation import backbone, BodyState, rattle_covariance
+from continuum_loc.estimator.loads import Loads
 from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
@@ -34,6 +37,7 @@ from continuum_loc.estimator.solver import track
 from continuum_loc.estimator.start import Start
 from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
 from continuum_loc.estimator.window import Window
+from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.measurements import Measurement, nanoseconds, seconds
 from continuum_loc.robot import RobotDescription
 import numpy as np
@@ -81,6 +85,42 @@ class SlidingWindowFilter:
         self._needed = {one.needed() for one in self.factors if one.needed()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
+        self._watch()
+        tendons = next((one for one in self.factors if isinstance(one, MechanicsFactor)), None)
+        self._loads = Loads(self.setup, self.window, tendons) if tendons else None
+        self.start = Start(self.setup, self.window, self.factors)
+        self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
+        self._cycle = Cycle(self.factors, self.settings.output_rate)
+
+    def forget_faults(self) -> None:
+        """Believe every sensor again, until it is found out anew; the body stays."""
+        acquired = self.recovery.acquired
+        for factor in self.factors:
+            factor.weigh((), 1.0)
+        self._watch()
+        self.recovery.acquired = acquired
+        for interval in self.window.intervals:
+            interval.changed = True
+
+    def use_map(self, prior_map: PriorMap) -> None:
+        """
+        Match to another map from now on; the body and its biases stay, faults are forgotten.
+
+        What was measured in the window is matched anew. A filter that had no map starts anew, and
+        so does one whose base is searched for, since it is in the map that it is.
+        """
+        anew = self.setup.prior_map is None or self.start.wanted
+        self.setup = replace(self.setup, prior_map=prior_map)
+        if anew:
+            self.reset()
+            return
+        for factor in self.factors:
+            rows = [row for interval in self.window.intervals for row in interval.rows(factor)]
+            factor.use_map(self.setup, rows)
+        self.forget_faults()
+
+    def _watch(self) -> None:
+        """Make those who watch how well it fits, without a past."""
         self.health = Health(self.robot, self.window, self.factors, self.settings.health)
         self.recovery = Recovery(
             self.robot, self.window, self.factors, self.health, self.settings.recovery
@@ -323,6 +363,8 @@ class SlidingWindowFilter:
         before, lagged, fit = now - self.settings.lag, None, fit_of(self.window.intervals)
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
             lagged = self._compose(before, fit, outcome, started)
+        if self._loads is not None:
+            self._loads.look(now)
         return self._compose(now, fit, outcome, started, lagged)
 
     def _status(self) -> Status:
@@ -380,4 +422,5 @@ class SlidingWindowFilter:
             lagged=lagged,
             T_map_frame=T_map_frame,
             frame_covariance=frame_covariance,
+            loads=self._loads.found if self._loads is not None else (),
         )

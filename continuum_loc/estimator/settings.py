@@ -201,6 +201,12 @@ class MechanicsSettings(Settings):
         gt=0.0,
         description='scale of the Cauchy loss in sigmas: what touches something counts little',
     )
+    loads: bool = Field(True, description='whether forces are looked for')
+    load_period: float = Field(0.1, ge=0.0, description='least time between two looks [s]')
+    load_evidence: float = Field(
+        15.0, gt=0.0, description='by how much a force has to lower the misfit to be told (chi2)'
+    )
+    least_force: float = Field(0.2, ge=0.0, description='a weaker force is not told [N]')
 
 
 class SolverSettings(Settings):

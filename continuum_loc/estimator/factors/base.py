@@ -166,6 +166,9 @@ class Factor(ABC):
         self.weights = np.array([weight if name in doubted else 1.0 for name in self.sensors])
         return not np.array_equal(before, self.weights)
 
+    def use_map(self, setup: Setup, rows: list[tuple]) -> None:  # noqa: B027
+        """Match to the map of `setup` from now on, and what is in these rows anew."""
+
     def loosen(self, iteration: int) -> bool:
         """
         Match as widely as befits an iteration (1, 2, ...) from a guess, 0 as while tracking.

@@ -153,6 +153,11 @@ class TofFactor(Factor):
     def tight(self):
         return self.rules.gate <= self._tracking.gate
 
+    def use_map(self, setup, rows):
+        self.surface = setup.surface
+        for row in rows:
+            row.hits[:], row.places[:] = unmatched(len(row.hits))
+
     def loosen(self, iteration):
         """
         Open the gate, widest at first, and tighten the loss.

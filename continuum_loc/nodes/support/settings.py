@@ -26,7 +26,7 @@ class EstimatorNodeSettings(NodeSettings):
     """Node `estimator`."""
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
-    map: str = Field(  # noqa: A003  (a parameter's public name)
+    map: str = live(  # noqa: A003  (a parameter's public name)
         '', description='prior map: npz, a cloud or a mesh (see docs/files.md); empty for none'
     )
     settings: str = Field(
