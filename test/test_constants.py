@@ -322,7 +322,11 @@ def test_a_late_board_is_named_and_nobody_else():
 
 
 def test_a_recording_with_truth_tells_mounts_and_ranges():
-    """Mounts 2 mm and 1 deg off are found to 1 mm and 0.2 deg: root mean squares over sensors."""
+    """
+    Mounts 2 mm and 1 deg off are found to 0.5 mm along the beams and 0.2 deg, and as well as told.
+
+    Root mean squares over sensors. Along the body they stay unknown: walls are smooth there.
+    """
     robot = described({'mount_position': 0.002, 'mount_rotation_deg': 1.0})
     true_robot = truly(robot, 5)
     settings = parse_settings(EstimatorSettings, {'knot_period': 0.1, 'window': 0.6, 'lag': 0.2})
@@ -335,8 +339,10 @@ def test_a_recording_with_truth_tells_mounts_and_ranges():
         ]
     )
     assert found.converged
-    assert np.sqrt(np.mean(off[:, :3] ** 2)) < 1e-3
+    assert np.sqrt(np.mean(off[:, 0] ** 2)) < 5e-4
     assert np.degrees(np.sqrt(np.mean(off[:, 3:] ** 2))) < 0.2
+    stated = np.array([found.sigma[one.at] for one in found.parameters.blocks])
+    assert 0.5 < np.sqrt(np.mean(np.square(off / stated))) < 1.6
     assert found.robot.trackers == robot.trackers
     assert '| r1_tof0 mount x | 0 +- 2.00 mm |' in told(found)
 

@@ -85,6 +85,7 @@ class SlidingWindowFilter:
         self._needed = {one.needed() for one in self.factors if one.needed()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
+        self._calibrator = self._new_calibrator()
         self._watch()
         tendons = next((one for one in self.factors if isinstance(one, MechanicsFactor)), None)
         self._loads = Loads(self.setup, self.window, tendons) if tendons else None
@@ -126,10 +127,9 @@ class SlidingWindowFilter:
             self.robot, self.window, self.factors, self.health, self.settings.recovery
         )
         self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
-        self._calibrator = self._new_calibrator()
-        self.start = Start(self.setup, self.window, self.factors)
-        self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
-        self._cycle = Cycle(self.factors, self.settings.output_rate)
+        if self._calibrator is not None:
+            self.health.corrected = {}
+            self.doubts.base.spread = self._calibrator.spread
 
     # -------------------------------------------------------------- measurements in, estimates out
 
@@ -305,10 +305,7 @@ class SlidingWindowFilter:
         parameters = Parameters(self.robot, middle=middle)
         if parameters.size == 0:
             return None
-        self.health.corrected = {}
-        calibrator = Calibrator(parameters, self.window, self.settings.calibration)
-        self.doubts.base.spread = calibrator.spread
-        return calibrator
+        return Calibrator(parameters, self.window, self.settings.calibration)
 
     def _calibrate(self, time: float) -> None:
         """Read the window anew where the robot turned out to be another than it was taken for."""
