@@ -40,10 +40,10 @@ NOBLE_QUICK := test_lie test_gp test_chain test_factors test_window test_filter_
 	test_bag test_cli test_node_parameters test_node_estimator
 
 test-noble: $(NOBLE)/installed
-	PYTHONPATH=. $(NOBLE)/bin/python -m pytest test
+	PYTHONPATH=$(CURDIR) $(NOBLE)/bin/python -m pytest test
 
 test-noble-quick: $(NOBLE)/installed
-	PYTHONPATH=. $(NOBLE)/bin/python -m pytest $(NOBLE_QUICK:%=test/%.py)
+	PYTHONPATH=$(CURDIR) $(NOBLE)/bin/python -m pytest $(NOBLE_QUICK:%=test/%.py)
 
 $(NOBLE)/installed: requirements-noble.txt
 	@.ci/system-libraries
