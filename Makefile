@@ -1,5 +1,5 @@
-# make demo | test | test-noble | test-noble-quick | lint | bench | bench-check | profile | install | clean. Everything runs in .venv, which `install` makes.
-.PHONY: install demo test test-noble test-noble-quick lint bench bench-check profile clean
+# make demo | test | test-noble | test-noble-quick | test-launch | docs | lint | bench | bench-check | profile | install | clean. Everything runs in .venv, which `install` makes.
+.PHONY: install demo test test-noble test-noble-quick test-launch docs lint bench bench-check profile clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
@@ -40,16 +40,27 @@ NOBLE_QUICK := test_lie test_gp test_chain test_factors test_window test_filter_
 	test_bag test_cli test_node_parameters test_node_estimator
 
 test-noble: $(NOBLE)/installed
-	PYTHONPATH=. $(NOBLE)/bin/python -m pytest test
+	PYTHONPATH=$(CURDIR) $(NOBLE)/bin/python -m pytest test
 
 test-noble-quick: $(NOBLE)/installed
-	PYTHONPATH=. $(NOBLE)/bin/python -m pytest $(NOBLE_QUICK:%=test/%.py)
+	PYTHONPATH=$(CURDIR) $(NOBLE)/bin/python -m pytest $(NOBLE_QUICK:%=test/%.py)
 
 $(NOBLE)/installed: requirements-noble.txt
 	@.ci/system-libraries
 	$(NOBLE_PYTHON) -m venv --clear $(NOBLE)
 	$(NOBLE)/bin/python -m pip install --quiet --no-deps -r requirements-noble.txt
 	@touch $@
+
+# The API by sphinx, without a warning, into build/api.
+docs: install
+	$(RUN)/python -m pip install --quiet -r docs/api/requirements.txt
+	for package in continuum_loc msg_tools; do \
+		$(RUN)/sphinx-apidoc -q --force --separate --module-first --no-toc -o docs/api/generated $$package || exit 1; done
+	$(RUN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs/api build/api
+
+# Where ROS is installed, and this package beside it by colcon.
+test-launch:
+	launch_test test/launch/every_file.py
 
 lint: install
 	$(RUN)/ruff check .

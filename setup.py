@@ -19,7 +19,7 @@ def _files(folder: str, *patterns: str) -> list[str]:
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     description='Online localisation and shape estimation of continuum robots',
     license='Apache-2.0',
     packages=find_packages(include=['continuum_loc*', 'msg_tools*']),
@@ -32,6 +32,7 @@ setup(
         (f'share/{NAME}/launch', _files('launch', '*.launch.py')),
         (f'share/{NAME}/config', _files('config', '*.yaml')),
         (f'share/{NAME}/rviz', _files('rviz', '*.rviz')),
+        (f'share/{NAME}/foxglove', _files('foxglove', '*.json')),
         # `ros2 run` looks in lib/<package>. Modern pip ignores the redirect of setup.cfg and puts
         # the commands on PATH alone, so small wrappers go there; under colcon its own scripts of
         # the same name win.

@@ -13,12 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 import json
+import os
 from pathlib import Path
 import shutil
 import sys
 from typing import Annotated, Any, TYPE_CHECKING
 
 from continuum_loc.errors import (
+    CalibrationError,
     ContinuumLocError,
     InputError,
     MapError,
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from continuum_loc.offline.tune import Trying
 
 OK, FAILED, USAGE = 0, 1, 2
+CORES = len(os.sched_getaffinity(0))  # that this process may use
 
 app = typer.Typer(
     name='continuum-loc',
@@ -50,6 +53,12 @@ map_app = typer.Typer(
     rich_markup_mode='markdown',
 )
 app.add_typer(map_app, name='map')
+robot_app = typer.Typer(
+    no_args_is_help=True,
+    help='Use robot descriptions elsewhere.',
+    rich_markup_mode='markdown',
+)
+app.add_typer(robot_app, name='robot')
 console = Console()
 errors = Console(stderr=True)
 
@@ -159,6 +168,15 @@ def simulate(
             '`disturbed:mounts+base` takes parts alone',
         ),
     ] = 'ideal',
+    carried: Annotated[
+        str,
+        typer.Option(
+            help='what carries the base: `smooth`, `brisk`, `stops`, `wrist`, or your own (YAML)'
+        ),
+    ] = '',
+    told: Annotated[
+        str, typer.Option(help='how that tells where the base is: `arm` or `odometry`')
+    ] = 'arm',
     duration: Annotated[
         float | None, typer.Option(help='seconds; default: the whole trajectory')
     ] = None,
@@ -182,6 +200,8 @@ def simulate(
         seed=seed,
         duration=duration,
         world=world_name,
+        carried=carried,
+        told=told,
     )
     with _busy() as status:
         status.update('building the scene and letting the robot come to rest')
@@ -273,6 +293,56 @@ def replay(
     folder = new_run('replay', out)
     summary = save_run(folder, result, kind='replay', seed=seed, configuration=configuration)
     raise typer.Exit(USAGE if _tell(folder, summary) else OK)
+
+
+@app.command()
+def check(
+    bag: Annotated[
+        Path | None, typer.Argument(help='bag folder or file; without one the running graph')
+    ] = None,
+    robot: Robot = 'engine',
+    map_file: MapFile = None,
+    settings: Settings = None,
+    namespace: Namespace = '',
+    frame_prefix: Prefix = '',
+    seconds: Annotated[
+        float, typer.Option(help='how long to listen to a running graph', min=2.0)
+    ] = 10.0,
+) -> None:
+    """
+    Check a running graph, or a bag, against the robot description and the map.
+
+    Topics, rates, clocks, frames, units, and mounts as far as the map tells. The exit code is 1
+    where something is wrong.
+
+    Example: `continuum-loc check --robot my_robot.yaml --map my_map.ply`
+    """
+    from tempfile import TemporaryDirectory
+
+    from continuum_loc.estimator import settings_of
+    from continuum_loc.mapping.scale import map_for
+    from continuum_loc.offline.check import check_bag
+    from continuum_loc.offline.localise import make_filter
+    from continuum_loc.robot import load_robot
+
+    description = load_robot(robot)
+    with TemporaryDirectory() as folder, _busy() as status:
+        if bag is None:
+            from continuum_loc.nodes.recorder import record_for
+
+            status.update(f'listening for {seconds:g} s')
+            bag = Path(folder) / 'heard'
+            record_for(seconds, bag, namespace)
+        status.update('checking')
+        prior = None if map_file is None else map_for(description, map_file)
+        chosen = settings_of(description.name, settings)
+        estimator = make_filter(description, prior, chosen)
+        findings = check_bag(bag, estimator, namespace, frame_prefix)
+    colours = {'ok': 'green', 'warning': 'yellow', 'error': 'bold red'}
+    for one in findings:
+        said = f'[{colours[one.level]}]{one.level:8}[/] {escape(one.matter)}: {escape(one.text)}'
+        console.print(said, highlight=False, soft_wrap=True)
+    raise typer.Exit(FAILED if any(one.level == 'error' for one in findings) else OK)
 
 
 @app.command()
@@ -456,6 +526,55 @@ def identify(
     console.print(f'written {out}')
 
 
+@app.command()
+def calibrate(
+    bags: Annotated[list[Path], typer.Argument(help='bags of one robot in one place')],
+    out: Annotated[Path, typer.Option(help='description to write (YAML)')],
+    robot: Robot = 'engine',
+    map_file: Annotated[Path | None, typer.Option('--map', help='prior map')] = None,
+    settings: Annotated[str, typer.Option(help="estimator's, by name or file")] = '',
+    reference: Annotated[
+        str, typer.Option(help='what tells where the rings were: none, tracker or truth')
+    ] = 'none',
+) -> None:
+    """
+    Find what a robot departs from its description by: mounts, ranges, gyros, clocks, base.
+
+    The description's `tolerances` say how far each may be off. Writes a new description, the
+    covariance that is left, and a report that says what the bags do not show.
+
+    Example: `continuum-loc calibrate runs/a --robot mine.yaml --map cell.npz --out found.yaml`
+    """
+    from continuum_loc.estimator.settings import settings_of
+    from continuum_loc.mapping.map_files import load_map
+    from continuum_loc.offline.calibrated import calibrate_bags, write_calibration
+    from continuum_loc.robot import load_robot
+
+    description = load_robot(robot)
+    if description.tof and map_file is None:
+        raise CalibrationError(
+            f"robot '{description.name}' has ToF sensors, which tell nothing without a map: "
+            'give the one of this place with --map'
+        )
+    chosen = settings_of(description.name, settings or None)
+    with _busy() as status:
+        found = calibrate_bags(
+            description,
+            load_map(map_file) if map_file else None,
+            bags,
+            chosen,
+            reference,
+            lambda doing, done: status.update(f'{doing}: {done:.1f}'),
+        )
+    said = 'converged' if found.converged else 'not converged'
+    console.print(
+        f'{len(found.theta)} constants, {len(found.unseen())} of them hardly told; {said}',
+        highlight=False,
+    )
+    for path in write_calibration(found, chosen.calibration.least, out):
+        console.print(f'written {path}', highlight=False, soft_wrap=True)
+
+
 def _tell_sweep(start: Trying, best: Trying) -> None:
     for name, one in (('start', start), ('best', best)):
         console.print(
@@ -510,7 +629,7 @@ def evaluate(
         Path | None, typer.Option(help='folder of the results; default: a new run')
     ] = None,
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option(help='processes', min=1)] = 1,
+    jobs: Annotated[int, typer.Option(help='processes; one for each core', min=1)] = CORES,
     minutes: Annotated[
         float | None, typer.Option(help='with `soak`: how long, instead of half an hour', min=0.5)
     ] = None,
@@ -518,9 +637,7 @@ def evaluate(
         list[str] | None,
         typer.Option('--world', help='`ideal` or `disturbed` alone; studies print both'),
     ] = None,
-    scheduler: Annotated[
-        str, typer.Option(help='address of a Dask scheduler to run the trials on')
-    ] = '',
+    scheduler: Annotated[str, typer.Option(help='Dask scheduler that runs the trials')] = '',
     robot: Annotated[str, typer.Option(help='with `bags`: the robot')] = 'engine',
     map_file: Annotated[
         Path | None, typer.Option('--map', help='with `bags`: the prior map')
@@ -534,7 +651,7 @@ def evaluate(
 
     An interrupted study continues where it stopped when its `--out` is given again.
 
-    Example: `continuum-loc evaluate table2 --quick --jobs 2`, `continuum-loc evaluate bags my_bags
+    Example: `continuum-loc evaluate table2 --quick`, `continuum-loc evaluate bags my_bags
     --map my_map.npz`
     """
     from continuum_loc.offline.parallel import SCHEDULER
@@ -775,6 +892,29 @@ def map_convert(
     prior = load_map(source, viewpoint=viewpoint, scale=scale, sigma=sigma, spacing=spacing)
     prior.save(out)
     _describe_map(out, prior)
+
+
+@robot_app.command('urdf')
+def robot_urdf(
+    robot: Annotated[str, typer.Argument(help='a bundled robot, or a description (YAML)')],
+    out: Annotated[
+        Path | None, typer.Argument(help='file to write; printed where there is none')
+    ] = None,
+    base_frame: Annotated[str, typer.Option(help="name of the base's link")] = 'base_link',
+) -> None:
+    """
+    Write a URDF of a robot description, for robot_state_publisher and RViz.
+
+    Example: `continuum-loc robot urdf engine engine.urdf`
+    """
+    from continuum_loc.offline.urdf import urdf
+    from continuum_loc.robot import load_robot
+
+    text = urdf(load_robot(robot), base_frame)
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        out.write_text(text)
 
 
 @map_app.command('info')

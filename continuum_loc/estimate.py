@@ -11,6 +11,22 @@ Status = Literal['initialising', 'tracking', 'doubtful', 'lost']
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PointLoad:
+    """
+    A force on the body that its tendons and its weight do not explain.
+
+    s: arclength [m], and its standard deviation `s_sigma`. force (3,) [N] in the map, at `place`
+    (3,), with covariance (3, 3).
+    """
+
+    s: float
+    s_sigma: float
+    place: np.ndarray
+    force: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """
     The body at one instant.
@@ -33,6 +49,7 @@ class Estimate:
     suspects: why a sensor is not to be believed, by name.
     T_map_frame: (4, 4) pose of the frame in which a carried base is measured, `map -> odom` where
     that is odometry; None where the base is not measured. frame_covariance: (6, 6) of it.
+    loads: what the body touches, where shape and tendons tell; strongest evidence first.
     lagged: the same body at `stamp - lag`, smoothed by everything since; None before there is one.
     """
 
@@ -55,6 +72,7 @@ class Estimate:
     lagged: Estimate | None = None
     T_map_frame: np.ndarray | None = None
     frame_covariance: np.ndarray | None = None
+    loads: tuple[PointLoad, ...] = ()
 
     @property
     def least_known(self) -> tuple[int, float, np.ndarray]:

@@ -75,12 +75,47 @@ class Mount(Settings):
         return T_ring_sensor
 
 
+def mounted(T_ring_sensor: np.ndarray) -> Mount:
+    """Describe a mount by its pose (4, 4)."""
+    return Mount(xyz=tuple(T_ring_sensor[:3, 3].tolist()), rpy_deg=_rpy_deg(T_ring_sensor))
+
+
+def _rpy_deg(T: np.ndarray) -> Vector3:
+    rpy_deg = Rotation.from_matrix(T[:3, :3]).as_euler('xyz', degrees=True)
+    return tuple(rpy_deg.tolist())
+
+
 class Sensor(Settings):
     """A sensor's name (its `frame_id`), its ring and its mount there."""
 
     name: Name
     ring: str
     mount: Mount = Mount(xyz=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
+    clock: float = Field(0.0, description='true time less stamp [s]')
+
+
+class TofSensor(Sensor):
+    """A ToF sensor: what it reads is `range_scale` times the distance, plus `range_offset`."""
+
+    range_offset: float = Field(0.0, description='reading of a distance of none [m]')
+    range_scale: float = Field(1.0, gt=0.5, lt=2.0, description='reading over distance')
+
+
+class ImuSensor(Sensor):
+    """An IMU: its gyro reads `gyro_axes` times the angular velocity, plus `gyro_bias`."""
+
+    gyro_axes: tuple[Vector3, Vector3, Vector3] = Field(
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description='rows: the axes as they are, times their scales',
+    )
+    gyro_bias: Vector3 = Field((0.0, 0.0, 0.0), description='reading at rest [rad/s]')
+
+    @field_validator('gyro_axes')
+    @classmethod
+    def _usable(cls, value: tuple) -> tuple:
+        if not 0.1 < float(np.linalg.det(np.array(value))) < 10.0:
+            raise ValueError('must be three right-handed axes of about unit length')
+        return value
 
 
 class Ring(Settings):
@@ -172,6 +207,11 @@ class Base(Settings):
     )
     insertion: Insertion = Insertion()
     measurement: BaseMeasurement = BaseMeasurement()
+    region: tuple[float, float] = Field(
+        (0.0, 0.0),
+        description='how far from there a free base may begin [m, deg]; with (0, 0) it begins '
+        'there, and 180 deg and a way that is longer than the map leave it anywhere in it',
+    )
     speed: tuple[float, float] = Field(
         (0.3, 0.5), description='how fast a carried base moves and turns, 1 sigma [m/s, rad/s]'
     )
@@ -179,6 +219,13 @@ class Base(Settings):
         (0.01, 0.03),
         description='white noise on the acceleration of a carried base [m^2/s^3, rad^2/s^3]',
     )
+
+    @field_validator('region')
+    @classmethod
+    def _not_negative(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if min(value) < 0.0:
+            raise ValueError('both must be 0 or greater')
+        return value
 
     @field_validator('speed', 'acceleration')
     @classmethod
@@ -194,6 +241,12 @@ class Base(Settings):
         T_map_base[:3, :3] = Rotation.from_euler('xyz', self.rpy_deg, degrees=True).as_matrix()
         T_map_base[:3, 3] = self.xyz
         return T_map_base
+
+
+def based(base: Base, T_map_base: np.ndarray) -> Base:
+    """Move a base to a pose (4, 4) at zero insertion."""
+    moved = {'xyz': tuple(T_map_base[:3, 3].tolist()), 'rpy_deg': _rpy_deg(T_map_base)}
+    return Base(**{**base.model_dump(), **moved})
 
 
 class Backbone(Settings):
@@ -309,6 +362,37 @@ class StrainModel(Settings):
     theta_sigma: float = Field(
         0.015, gt=0.0, description='white noise of the bending-plane angle [rad]'
     )
+    scale: float = Field(1.0, gt=0.1, lt=10.0, description='curvature read over curvature')
+    twist_deg: float = Field(0.0, description='of the sensor about the backbone [deg]')
+    offset: tuple[float, float] = Field(
+        (0.0, 0.0), description='bending strain about y and z read where there is none [1/m]'
+    )
+    clock: float = Field(0.0, description='true time less stamp [s]')
+
+
+class Tolerances(Settings):
+    """
+    How far a robot may be from its description, 1 sigma: what people build and buy.
+
+    0 says that something is exactly as described.
+    """
+
+    mount_position: float = Field(0.002, ge=0.0, description='of a sensor, per axis [m]')
+    mount_rotation_deg: float = Field(1.0, ge=0.0, description='of a sensor, per axis [deg]')
+    range_offset: float = Field(0.008, ge=0.0, description='of a ToF sensor [m]')
+    range_scale: float = Field(0.015, ge=0.0, description='of a ToF sensor, relative')
+    gyro_scale: float = Field(0.02, ge=0.0, description='of each axis, relative')
+    gyro_axes_deg: float = Field(2.0, ge=0.0, description='of each axis from its place [deg]')
+    strain_scale: float = Field(0.03, ge=0.0, description='relative')
+    strain_twist_deg: float = Field(5.0, ge=0.0, description='about the backbone [deg]')
+    strain_offset: float = Field(0.05, ge=0.0, description='of either bending [1/m]')
+    clock: float = Field(0.015, ge=0.0, description='of each board [s]')
+    delay: float = Field(0.005, ge=0.0, description='of each sensor beside its board [s]')
+    base_position: float = Field(0.005, ge=0.0, description='per axis [m]')
+    base_rotation_deg: float = Field(0.7, ge=0.0, description='per axis [deg]')
+    map_position: float = Field(0.0, ge=0.0, description='of the map, per axis [m]')
+    map_rotation_deg: float = Field(0.0, ge=0.0, description='of the map, per axis [deg]')
+    length: float = Field(0.003, ge=0.0, description='of the backbone, relative')
 
 
 class HallModel(Settings):
@@ -342,14 +426,15 @@ class RobotDescription(Settings):
     backbone: Backbone = Backbone()
     rings: tuple[Ring, ...] = Field(min_length=1)
     tof_model: TofModel = TofModel()
-    tof: tuple[Sensor, ...] = ()
+    tof: tuple[TofSensor, ...] = ()
     imu_model: ImuModel = ImuModel()
-    imu: tuple[Sensor, ...] = ()
+    imu: tuple[ImuSensor, ...] = ()
     strain: StrainModel | None = None
     hall_model: HallModel = HallModel()
     hall: tuple[Sensor, ...] = ()
     magnet: Magnet | None = None
     trackers: tuple[Sensor, ...] = ()
+    tolerances: Tolerances = Tolerances()
     actuation: Actuation | None = None
 
     @model_validator(mode='after')

@@ -58,6 +58,15 @@ class TwistRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LoadRecord:
+    """`load`: the strongest force on the body (3,) [N], and its moment about the map's origin."""
+
+    stamp: int
+    force: np.ndarray
+    moment: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CloudRecord:
     """
     `reconstruction` or `prior_map`: one (N,) array per field of the cloud.

@@ -25,6 +25,7 @@ from msg_tools.records import (
     CloudRecord,
     DiagnosticsRecord,
     FrameRecord,
+    LoadRecord,
     PathRecord,
     PosesRecord,
     TipRecord,
@@ -156,6 +157,32 @@ def _velocity(twist: Any) -> tuple[np.ndarray, np.ndarray]:
     """(6,) [v; w] and (6, 6) of a TwistWithCovariance."""
     velocity = np.concatenate([vector(twist.twist.linear), vector(twist.twist.angular)])
     return velocity, np.array(twist.covariance, float).reshape(6, 6)
+
+
+def load_message(make: Messages, item: Any) -> Any:
+    """WrenchStamped in `map`, about its origin, of an Estimate's first load, or of a record."""
+    if isinstance(item, LoadRecord):
+        force, moment = item.force, item.moment
+    else:
+        force, moment = np.zeros(3), np.zeros(3)
+        for load in item.loads[:1]:
+            force, moment = load.force, np.cross(load.place, load.force)
+    return make(
+        'geometry_msgs/msg/WrenchStamped',
+        header=header_message(make, item.stamp, MAP),
+        wrench=make(
+            'geometry_msgs/msg/Wrench',
+            force=vector_message(make, force),
+            torque=vector_message(make, moment),
+        ),
+    )
+
+
+def load_record(message: Any, where: str = 'load') -> LoadRecord:
+    """Read the strongest force on the body."""
+    require_map(message.header, where)
+    wrench = message.wrench
+    return LoadRecord(stamp_of(message.header, where), vector(wrench.force), vector(wrench.torque))
 
 
 def columns_message(make: Messages, cloud: CloudRecord, frame_id: str = MAP) -> Any:

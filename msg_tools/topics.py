@@ -120,7 +120,11 @@ TOPICS: dict[str, Topic] = {
         lambda make, item: results.tip_message(make, tip_of(item), 'tip'),
         _read(results.tip_record),
     ),
+    'base/hypotheses': Topic('geometry_msgs/msg/PoseArray', _poses, _read(results.poses_record)),
     'base/frame': Topic(_POSE, results.frame_message, _read(results.frame_record)),
+    'load': Topic(
+        'geometry_msgs/msg/WrenchStamped', results.load_message, _read(results.load_record)
+    ),
     RING_POSE: Topic(_POSE, convert.tracker_message, _pose_of_one),
     RING_TWIST: Topic(
         'geometry_msgs/msg/TwistWithCovarianceStamped',
@@ -160,6 +164,8 @@ OUTPUTS = (
     'backbone',
     'tip',
     'base/frame',
+    'base/hypotheses',
+    'load',
     RING_POSE,
     RING_TWIST,
     'reconstruction',

@@ -79,8 +79,18 @@ def sets() -> dict[str, list[str]]:
 
 
 def told(trials: Iterable[Trial]) -> list[str]:
-    """Tell what decides each trial, once, in a fixed order."""
-    return sorted({json.dumps(asdict(trial), sort_keys=True) for trial in trials})
+    """
+    Tell what decides each trial, once, in a fixed order.
+
+    What is as it is by default is left out, so that a trial stays the same when others may be told
+    more.
+    """
+    usual = asdict(Trial())
+    said = (
+        {name: value for name, value in asdict(trial).items() if value != usual[name]}
+        for trial in trials
+    )
+    return sorted({json.dumps(one, sort_keys=True) for one in said})
 
 
 def checksums() -> str:

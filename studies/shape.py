@@ -37,8 +37,11 @@ SPAN = 0.075  # m, from the magnet to the last module: what the paper's curves c
 SAMPLES = 301  # points along a curve: the polyline's own error stays below a tenth of a micrometre
 FRACTIONS = np.linspace(0.0, 1.0, 151)
 METHODS: tuple[CurveMethod, ...] = ('quadratic_bezier', 'cubic_bezier', 'kasa_arc')
-PAPER_MAE = {'straight': 0.02, '160 mm': 0.70, '80 mm': 0.84}  # mm, arc
-ARC_LIMIT = {'straight': 0.02, '160 mm': 0.35, '80 mm': 0.42}  # mm, arc, with calibration
+# mm, arc. The paper cleared the background at rest, as `tared` does: 0.02, 0.70 and 0.84.
+ARC_LIMITS = {
+    'tared': {'straight': 0.02, '160 mm': 0.25, '80 mm': 0.35},
+    'calibrated': {'straight': 0.02, '160 mm': 0.35, '80 mm': 0.42},  # in ten poses
+}
 # Bending about the IMU's x axis, which is roll in eq. 3, is the plane in which print errs least.
 PLANES = {'roll': -90.0, 'between': 45.0, 'pitch': 0.0}  # azimuth [deg]
 
@@ -361,12 +364,13 @@ def _claims(tables: dict[str, Any], faults: Sequence[Row], milliseconds: float) 
     arc = partial(mae, 'grooves', curve='kasa_arc')
     claims = [
         at_most(
-            f'arc MAE, {groove} groove, calibrated',
-            arc(groove=groove, pipeline='calibrated'),
+            f'arc MAE, {groove} groove, {pipeline}',
+            arc(groove=groove, pipeline=pipeline),
             'mm',
             limit,
         )
-        for groove, limit in ARC_LIMIT.items()
+        for pipeline, limits in ARC_LIMITS.items()
+        for groove, limit in limits.items()
     ]
     claims += [
         at_most(
@@ -375,7 +379,7 @@ def _claims(tables: dict[str, Any], faults: Sequence[Row], milliseconds: float) 
             'mm',
             3.0,
         )
-        for groove in ARC_LIMIT
+        for groove in ARC_LIMITS['calibrated']
     ]
     claims += [
         at_least(

@@ -18,6 +18,7 @@ from continuum_loc.robot import RobotDescription
 from continuum_loc.settings import parse_settings
 import numpy as np
 import pytest
+import worlds
 from worlds import EPOCH, Rod, rod, room_map, stream
 
 DT = 0.1
@@ -308,3 +309,55 @@ def test_the_prior_of_a_base_is_let_go_beyond_its_spread(shift, weight):
     still = symmetric(priors.start(column_at_rest(grid, np.eye(4), rest, 0.0)).H)
     expected = 0.0005**-2.0 * (weight - 1.0)
     assert (found - still)[1, 1] == pytest.approx(expected, rel=1e-6, abs=1.0)
+
+
+def test_along_a_smooth_pipe_the_covariance_says_that_nothing_is_seen(monkeypatch):
+    """Walls along x alone, whose ends no sensor reaches: sideways it knows, along x it says so."""
+    monkeypatch.setattr(worlds, 'ROOM', np.array([[-9.0, -0.7, -0.6], [9.0, 0.8, 0.7]]))
+    robot = carried('free', sigma_position=0.001)
+    kept = (
+        one for one in carried_stream(CarriedRod(robot), 3.0) if not isinstance(one, BaseSample)
+    )
+    _, estimates, errors, _ = run(robot, kept, room_map(0.05))
+    R = np.array([one.T_map_ring[1, :3, :3] for one in estimates])
+    P = np.array([one.covariance[1, :3, :3] for one in estimates])
+    sigma = np.sqrt(np.diagonal(R @ P @ np.swapaxes(R, 1, 2), axis1=1, axis2=2))  # in map
+    assert sigma[-1, 0] > 0.02 > 5.0 * sigma[-1, 1:].max()
+    assert sigma[-1, 0] > 2.0 * sigma[0, 0]  # from one second to three
+    assert np.all(errors[:, 1] < 3.0 * sigma[:, 0]) and errors[:, 1].max() > 0.02
+    _, spread, axis = estimates[-1].least_known
+    assert spread > 0.02 and abs(axis[0]) > 0.95
+
+
+def test_a_measured_base_that_contradicts_the_rest_is_named(prior_map):
+    """An arm that is good to 1 mm tells places 2 cm aside: named, and the rings stay right."""
+    robot = carried(sigma_position=0.001, sigma_rotation_deg=0.1)
+    aside = lie.exp(np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0]))
+    samples = carried_stream(CarriedRod(robot), 3.0, lambda time: aside)
+    _, estimates, errors, _ = run(robot, samples, prior_map)
+    assert estimates[-1].suspects['base'].startswith('is not where it is told to be')
+    assert estimates[-1].status == 'doubtful'
+    half = len(errors) // 2
+    assert errors[half:, 1:].mean() < 0.003
+
+
+def test_a_late_stamp_is_taken_for_the_instant_that_it_tells_of(prior_map):
+    """A pose stamped at 55 ms and told to be 40 ms late is of 15 ms, and of the travel then."""
+    insertion = {'mode': 'measured', 'range': [0.0, 0.6], 'sigma': 0.002}
+    robot = carried(insertion=insertion, measurement={'latency': 0.04})
+    filter_ = SlidingWindowFilter(robot, prior_map)
+    rows = [BaseSample(EPOCH + nanoseconds(0.04), 'map', np.eye(4))]
+    rows += [
+        EncoderSample(EPOCH + nanoseconds(t), ('insertion',), np.array([x]), np.zeros(1))
+        for t, x in ((0.045, 0.1), (0.055, 0.2))
+    ]
+    rows.append(BaseSample(EPOCH + nanoseconds(0.09), 'map', np.eye(4)))
+    for sample in rows:
+        filter_.process(sample)
+    factor = next(one for one in filter_.factors if one.name == 'base')
+    interval = filter_.window.intervals[0]
+    interval.linearise(filter_.priors, *filter_.window.columns[:2])
+    batch = interval._batches[factor]
+    # The first sample is of the epoch less its latency, before which there is no window.
+    assert batch.times[-1] == pytest.approx(0.01) and len(batch.times) == 1
+    assert batch.T_frame_node[-1, 0, 3] == pytest.approx(0.15)

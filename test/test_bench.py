@@ -21,15 +21,14 @@ def test_a_benchmark_loads_and_its_table_has_a_place_in_the_document(name):
 
 def test_the_chain_given_to_gtsam_is_solved_to_the_motion_it_was_made_of():
     window = load_benchmark('window')
-    times, measured, information, guess, period = window._temporal_problem()
-    psd = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
-    T = window._gauss_newton(times, measured, information, guess, period, psd)
-    true = lie.exp(np.arange(window.KNOTS)[:, None] * period * window.TWIST)
+    problem = window._temporal_problem()
+    T = window._gauss_newton(problem)
+    true = lie.exp(np.arange(window.KNOTS)[:, None] * problem.period * window.TWIST)
 
     def furthest(poses):
         return np.abs(lie.log(lie.inverse(true) @ poses)).max()
 
-    assert furthest(T) < 0.01 < furthest(guess)  # a frame is off by 0.001, a guess by 0.05
+    assert furthest(T) < 0.01 < furthest(problem.guess)  # a frame is off by 0.001, a guess by 0.05
 
 
 def test_both_writers_of_a_bag_get_every_sample(tmp_path):

@@ -176,9 +176,9 @@ def test_every_way_to_a_filter_takes_the_robots_settings():
     made = make_filter(load_robot('engine'), None).settings
     assert (made.knot_period, made.tof.floor, made.prior.jerked) == (0.2, 0.0005, 40.0)
     trial = Trial('soft_arm', 'R1', 'b1')
-    assert trial_settings(trial).tof.footprint == 0.0
+    assert not trial_settings(trial).calibration.enabled
     real = trial_settings(Trial('soft_arm', 'R1', 'b1', fidelity='vl53l5cx'))
-    assert (real.tof.footprint, real.calibration_sigma) == (0.5, (0.003, 0.015))
+    assert (real.tof.footprint, real.calibration.enabled) == (0.5, True)
 
 
 def test_the_live_node_takes_the_robots_settings_or_those_given(tmp_path):

@@ -4,6 +4,7 @@ from continuum_loc import lie
 from continuum_loc.errors import SettingsError
 from continuum_loc.measurements import BaseSample, EncoderSample, NANOSECONDS, TruthSample
 from continuum_loc.offline.trials import Trial, with_base
+from continuum_loc.offline.trials import world as make_world
 from continuum_loc.robot import load_robot
 from continuum_loc.simulator.carrier import BaseTeller, Carrier, carrier, pose_of, Told
 from continuum_loc.simulator.plant import load_plant
@@ -112,3 +113,25 @@ def test_trials_that_differ_in_what_is_believed_of_the_base_share_a_recording():
 def test_an_unknown_carrier_is_refused_with_the_known_ones():
     with pytest.raises(SettingsError, match='smooth'):
         carrier('nobody', load_robot('engine'))
+
+
+@pytest.mark.parametrize(
+    'wrong, said', [({'told': 'hearsay'}, 'arm, odometry'), ({'world': 'disturbed'}, 'ideal')]
+)
+def test_a_carried_trial_that_cannot_be_is_refused(wrong, said):
+    with pytest.raises(SettingsError, match=said):
+        make_world(Trial(carried='smooth', **wrong))
+
+
+def test_a_carrier_of_ones_own_says_what_it_tells(tmp_path):
+    file = tmp_path / 'rail.yaml'
+    file.write_text(
+        'keyframes: [{time: 1.0}, {time: 2.0, xyz: [0.1, 0, 0], rpy_deg: [0, 0, 90]}]\n'
+        'told: {latency: 0.03}\n'
+    )
+    rail = carrier(str(file), load_robot('engine'))
+    assert rail.told.latency == 0.03
+    np.testing.assert_allclose(rail.command(5.0)[0], [0.1, 0, 0, np.pi / 2, 0, 0], atol=1e-12)
+    file.write_text('keyframes: [{time: 2.0}, {time: 1.0}]\n')
+    with pytest.raises(SettingsError, match='increase'):
+        carrier(str(file), load_robot('engine'))

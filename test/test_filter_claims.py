@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from test_tof_weights import arm, LENGTH, normal_at, WALL, wall
-from worlds import EPOCH, Rod, rod, room_map, stream
+from worlds import EPOCH, EXACT, Rod, rod, room_map, stream
 
 PERIOD = 0.1  # [s] between knots
 
@@ -70,6 +70,7 @@ def slider() -> RobotDescription:
             'backbone': {'rest_strain_sigma': [1e-5] * 6},
             'rings': [{'name': 'tip', 's': LENGTH}],
             'trackers': [{'name': 'coil', 'ring': 'tip'}],
+            'tolerances': EXACT,
         },
     )
 

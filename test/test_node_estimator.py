@@ -181,6 +181,42 @@ def test_initialpose_moves_the_base(fresh, box):
     assert moved == pytest.approx(0.03, abs=1e-3)
 
 
+def test_a_map_is_changed_while_the_node_runs_and_the_body_stays(fresh, box, tmp_path):
+    """Half of the points, in another order: what is in the window is matched anew."""
+    client, node, _ = fresh
+    box.play(client, 1.0)
+    assert client.until(lambda: client.heard['poses'])
+    head, *rows = box.map.read_text().splitlines()
+    order = np.random.default_rng(1).permutation(len(rows))[: len(rows) // 2]
+    other = tmp_path / 'other.csv'
+    other.write_text('\n'.join([head, *(rows[i] for i in order)]) + '\n')
+
+    def change(path):
+        request = SetParameters.Request(
+            parameters=[Parameter('map', value=str(path)).to_parameter_msg()]
+        )
+        return client.call(SetParameters, 'estimator/set_parameters', request).results[0]
+
+    result = change(tmp_path / 'absent.ply')
+    assert not result.successful and 'absent.ply' in result.reason
+    assert not change('').successful
+    result = change(other)
+    assert result.successful, result.reason
+    node.await_log(f'another map: {len(order)} points; shape and biases stay')
+    for items in client.heard.values():
+        items.clear()
+    box.play(client, 1.0)
+    assert client.until(lambda: len(client.heard['poses']) >= 10)
+    for pose in client.heard['poses']:
+        error = pose.T_map_body[:, :3, 3] - box.T_map_ring[:, :3, 3]
+        assert np.linalg.norm(error, axis=1).max() < 0.01
+    said = [record.statuses[0][3].get('status') for record in client.heard['/diagnostics']]
+    assert said and set(said) == {'tracking'}  # it did not start anew
+    assert change(box.map).successful
+    answer = client.call(Trigger, 'estimator/clear_faults', Trigger.Request())
+    assert answer.success and 'believed again' in answer.message
+
+
 def test_parameters_are_described_and_guarded(graph):
     client, _, _ = graph
     name = 'estimator/describe_parameters'

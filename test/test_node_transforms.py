@@ -210,6 +210,28 @@ def test_a_tree_forgets_what_is_old_and_follows_time_that_starts_again():
         tree.transform('map', 'cart')
 
 
+def test_the_newest_stamp_of_a_way_is_that_of_its_oldest_link():
+    tree = FrameTree()
+    tree.add('map', 'rail', np.eye(4), STAMP)
+    tree.add('map', 'rail', np.eye(4), STAMP + nanoseconds(0.3))
+    tree.add('rail', 'tool0', np.eye(4), STAMP + nanoseconds(0.1))
+    tree.add('tool0', 'flange', np.eye(4), None)
+    assert tree.latest('map', 'flange') == STAMP + nanoseconds(0.1)
+    assert tree.latest('tool0', 'flange') == STAMP + nanoseconds(0.1)
+    assert FrameTree().latest('map', 'nobody') is None
+
+
+def test_odometry_that_the_filter_knows_needs_no_other_frames(tf2):
+    """Where map -> odom is part of the estimate, it is what is sent, whatever /tf has."""
+    robot, graph = load_robot('engine'), Graph()
+    T = np.tile(np.eye(4), (len(robot.ring_names) + 1, 1, 1))
+    frames = transforms.Frames(robot, tf='odom')
+    T_map_odom = lie.exp(np.array([0.1, 0.2, 0.3, 0.1, 0.2, 0.3]))
+    transforms.Broadcaster(graph, frames, FrameTree()).send(STAMP, T, T_map_odom)
+    (moving,) = graph.published['/tf']
+    np.testing.assert_allclose(edges(moving)['map', 'odom'], T_map_odom, atol=1e-12)
+
+
 def test_two_robots_and_a_mobile_base_make_one_tree(tf2):
     """Every frame has one parent, whatever each robot publishes."""
     robot = load_robot('engine')

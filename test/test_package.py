@@ -440,3 +440,12 @@ def test_documents_name_files_that_there_are():
         if not any(path.endswith(f'/{name}') for path in kept)
     }
     assert not gone
+
+
+def test_the_version_is_the_same_wherever_it_is_written():
+    version = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')
+    assert re.search(rf'^version: {version}$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE)
+    newest = re.search(
+        r'^(\d+\.\d+\.\d+)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE
+    )
+    assert newest[1] == version

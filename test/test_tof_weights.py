@@ -14,6 +14,7 @@ from continuum_loc.robot import RobotDescription, TofModel
 from continuum_loc.settings import parse_settings
 import numpy as np
 import pytest
+from worlds import EXACT
 
 STAMP = 1_000_000_000
 LENGTH = 0.2  # [m]
@@ -39,6 +40,7 @@ def arm(zones: int = 1, base: tuple[float, float] = (SIGMA_BASE, 1e-4)) -> Robot
             'tof': [
                 {'name': 'eye', 'ring': 'tip', 'mount': {'xyz': [0, 0, 0], 'rpy_deg': [0, 0, 0]}}
             ],
+            'tolerances': EXACT,
         },
     )
 

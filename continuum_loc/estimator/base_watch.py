@@ -8,6 +8,8 @@ be; so the estimate itself shows how far off they are.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from continuum_loc import lie
 from continuum_loc.estimator.factors import Setup
 from continuum_loc.estimator.tolerance import BASE
@@ -28,7 +30,16 @@ class BaseWatch:
         base = setup.robot.base
         self._base, self._window, self._grid = base, window, setup.grid
         sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
+<<<<<<< HEAD
         self._variance = np.square(sigma) + np.square(BASE)
+=======
+        self._variance = np.square(sigma)
+        if setup.settings.calibration.enabled and base.mode == 'fixed':
+            told = setup.robot.tolerances
+            turn = np.radians(told.base_rotation_deg)
+            self._variance += np.square(np.repeat([told.base_position, turn], 3))
+        self.spread: Callable[[np.ndarray], np.ndarray] | None = None
+>>>>>>> main
         self._stays = base.measurement.frame == 'map' and base.measurement.drift == 0.0
         self._travel: tuple[float, float] | None = None  # [s], [m]
         self._since: dict[str, float] = {}
@@ -90,10 +101,14 @@ class BaseWatch:
         last = len(self._window.columns) - 1
         return self._window.chain.covariance(last - 1, np.zeros(J.shape), J)
 
+    def _lasting(self) -> np.ndarray:
+        """Covariance (6, 6) that estimated constants of the robot leave on the base."""
+        return np.zeros((6, 6)) if self.spread is None else self.spread(np.array([0]))[0]
+
     def _off(self, e: np.ndarray, J: np.ndarray, words: str) -> str:
         if e @ (e / self._variance) < FAR_SQUARED:
             return ''
-        spread = np.diag(self._variance) + self._own(J)
+        spread = np.diag(self._variance) + self._own(J) + self._lasting()
         if e @ np.linalg.solve(spread, e) < FAR_SQUARED:
             return ''
         shift, turn = np.linalg.norm(e[:3]), np.degrees(np.linalg.norm(e[3:]))

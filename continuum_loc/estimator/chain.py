@@ -15,10 +15,12 @@ solve, and covariances come from the same triangular factors (`Cholesky`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from continuum_loc.compiling import kernel
 from continuum_loc.errors import SingularError
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.normal import Normal
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -61,6 +63,10 @@ class Cholesky:
                 np.matmul(self._inverses[k], rest, out=X[rows[k], columns])
         return X
 
+    def unwhiten(self, B: np.ndarray) -> np.ndarray:
+        """L^-T B (D, m)."""
+        return blas.dtrsm(1.0, self.L, B, lower=1, trans_a=1)
+
     def lower(self, b: np.ndarray) -> np.ndarray:
         """L^-1 b (D,)."""
         return blas.dtrsv(self.L, b, lower=1)
@@ -93,6 +99,7 @@ class Chain:
     def __init__(self, dim: int, start: Normal):
         self.dim = dim
         self.marginals = [start]
+        self.border: Border | None = None  # of the oldest column, where constants are estimated
         self._eliminated: list[_Elimination] = []
         self._last: tuple[Cholesky, np.ndarray] | None = None
 
@@ -137,32 +144,59 @@ class Chain:
         """
         C^T H^-1 C (S, S) for C (K, D, S) over all columns, with H the chain's information.
 
-        It takes one forward substitution: sum y_k^T y_k with y_k = L_k^-1 (C_k - Y_k-1^T y_k-1).
+        It takes one forward substitution.
         """
-        total, right = np.zeros((C.shape[2], C.shape[2])), C[0]
+        return sum(y.T @ y for y in self.whiten(C))
+
+    def whiten(self, C: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """L^-1 C (K of (D, S)) for C (K, D, S) over all columns: L L^T = H."""
+        out, right = [], C[0]
         for k in range(len(C)):
-            y = self._factor(k).whiten(right)
-            total += y.T @ y
+            out.append(self._factor(k).whiten(right))
             if k + 1 < len(C):
-                right = C[k + 1] - self._eliminated[k].passed_on(y)
-        return total
+                right = C[k + 1] - self._eliminated[k].passed_on(out[-1])
+        return out
+
+    def unwhiten(self, Z: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """L^-T Z (K of (D, S)): with `whiten` before it, H^-1 C."""
+        out = [self._factor(len(Z) - 1).unwhiten(Z[-1])]
+        for k in range(len(Z) - 2, -1, -1):
+            out.append(self._factor(k).unwhiten(Z[k] - self._eliminated[k].Y @ out[-1]))
+        return out[::-1]
 
     def _factor(self, column: int) -> Cholesky:
         if column < len(self._eliminated):
             return self._eliminated[column].factor
         return self._last[0]
 
-    def forget_oldest(self, oldest: Normal, changed: bool) -> None:
+    def make_oldest_ready(self, oldest: Normal, changed: bool) -> None:
         """
-        Marginalise the oldest column through its interval: the next one's marginal is the start.
+        Eliminate the oldest column through its interval, where that has not been done.
 
-        `changed` says that the interval is not the one of the last solve, so that it has to be
-        eliminated anew.
+        `changed` says that the interval is not the one of the last solve.
         """
         if changed or not self._eliminated:
             self.marginals[1:], self._eliminated[:] = [], []
             self._eliminate(oldest, 0, 0.0)
+
+    def forget_oldest(self) -> None:
+        """Marginalise the oldest column: the next one's marginal becomes the start."""
         del self.marginals[0], self._eliminated[0]
+
+    def pass_on(self, older: np.ndarray, newer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Carry columns C (D, S) of the oldest column on to the next, as its elimination does.
+
+        older, newer: C at either. Returns C at the newer one, and Z = L^-1 C of the older.
+        """
+        step = self._eliminated[0]
+        Z = step.factor.whiten(older)
+        return newer - step.passed_on(Z), Z
+
+    @property
+    def oldest(self) -> np.ndarray:
+        """L^-1 (eta + g_a) (D,) of the oldest column, as its elimination left it."""
+        return self._eliminated[0].y
 
     def _forward(self, intervals: list[Normal], first: int, damping: float) -> None:
         first = min(first, len(self._eliminated))

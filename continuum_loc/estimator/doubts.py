@@ -70,7 +70,7 @@ class Doubts:
         self._comparisons = deque(one for one in (self._turns, self._bends) if one)
         self._curvature: deque[np.ndarray] = deque(maxlen=CURVATURES)
         self._noise: dict[str, deque[np.ndarray]] = {}
-        self._base = BaseWatch(setup, window)
+        self.base = BaseWatch(setup, window)
         self._off = False  # the window does not fit, and no round of explanations has been yet
         self._next_round, self._backoff, self._next_reading = 0.0, 1.0, 0.0
         self._unused = self._is_unused(setup)
@@ -85,7 +85,7 @@ class Doubts:
             self._recent.append(measurement)
             if isinstance(measurement, StrainSample):
                 self._hear_strain(measurement, time)
-            self._base.note(measurement, time)
+            self.base.note(measurement, time)
         self._read_at_once(measurement, time)
 
     def _read_at_once(self, measurement: Measurement, time: float) -> None:
@@ -126,10 +126,15 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
+<<<<<<< HEAD
         # Where the rest does not fit either, base and encoder are no better witnesses.
         off = self._does_not_fit()
         for name, cause in self._base.causes(time).items():
             self._tell((name,), '' if off else cause, time)
+=======
+        for name, cause in self.base.causes(time).items():
+            self._tell((name,), cause, time)
+>>>>>>> main
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time)

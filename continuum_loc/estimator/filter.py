@@ -8,32 +8,42 @@ and an `Estimate` comes out. `Recovery` notices a body in a wrong minimum and fi
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from operator import itemgetter
 import time as clock
 
+from continuum_loc.corrections import Corrections
 from continuum_loc.errors import MeasurementError, QueryError, SingularError
 from continuum_loc.estimate import Estimate, Status
+from continuum_loc.estimator.calibrator import Calibrator
 from continuum_loc.estimator.cycle import Cycle
 from continuum_loc.estimator.doubts import Doubts
 from continuum_loc.estimator.factors import Factor, FACTORS, Guess, Setup
+from continuum_loc.estimator.factors.mechanics import MechanicsFactor
 from continuum_loc.estimator.fit import Fit, fit_of, rattle
 from continuum_loc.estimator.health import Health
 from continuum_loc.estimator.interpolation import backbone, BodyState, rattle_covariance
+from continuum_loc.estimator.loads import Loads
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.query import History, state_at
 from continuum_loc.estimator.recovery import Recovery
 from continuum_loc.estimator.rest import InitialRest
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.solver import track
+from continuum_loc.estimator.start import Start
 from continuum_loc.estimator.state import column_at_rest, Grid, TIME_EPSILON
 from continuum_loc.estimator.window import Window
+from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.measurements import Measurement, nanoseconds, seconds
 from continuum_loc.robot import RobotDescription
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+MOST_CLOCK = 0.3  # [s] by which a clock may be off
 FIRST_PATIENCE = 0.5  # [s] that the first step waits for what tells base and shape
 
 
@@ -63,6 +73,7 @@ class SlidingWindowFilter:
     def reset(self) -> None:
         """Forget everything but the counts; the next measurement starts anew."""
         self.epoch: int | None = None
+        self._describe(self.robot)
         self.newest: int = 0
         self.priors.let_go(False)
         self.factors = [kind(self.setup) for kind in FACTORS if kind.wanted(self.setup)]
@@ -74,13 +85,51 @@ class SlidingWindowFilter:
         self._needed = {one.needed() for one in self.factors if one.needed()}
         self.window = Window(self.grid, self.priors, self.settings)
         self.history = History(self.settings.history)
+        self._calibrator = self._new_calibrator()
+        self._watch()
+        tendons = next((one for one in self.factors if isinstance(one, MechanicsFactor)), None)
+        self._loads = Loads(self.setup, self.window, tendons) if tendons else None
+        self.start = Start(self.setup, self.window, self.factors)
+        self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
+        self._cycle = Cycle(self.factors, self.settings.output_rate)
+
+    def forget_faults(self) -> None:
+        """Believe every sensor again, until it is found out anew; the body stays."""
+        acquired = self.recovery.acquired
+        for factor in self.factors:
+            factor.weigh((), 1.0)
+        self._watch()
+        self.recovery.acquired = acquired
+        for interval in self.window.intervals:
+            interval.changed = True
+
+    def use_map(self, prior_map: PriorMap) -> None:
+        """
+        Match to another map from now on; the body and its biases stay, faults are forgotten.
+
+        What was measured in the window is matched anew. A filter that had no map starts anew, and
+        so does one whose base is searched for, since it is in the map that it is.
+        """
+        anew = self.setup.prior_map is None or self.start.wanted
+        self.setup = replace(self.setup, prior_map=prior_map)
+        if anew:
+            self.reset()
+            return
+        for factor in self.factors:
+            rows = [row for interval in self.window.intervals for row in interval.rows(factor)]
+            factor.use_map(self.setup, rows)
+        self.forget_faults()
+
+    def _watch(self) -> None:
+        """Make those who watch how well it fits, without a past."""
         self.health = Health(self.robot, self.window, self.factors, self.settings.health)
         self.recovery = Recovery(
             self.robot, self.window, self.factors, self.health, self.settings.recovery
         )
         self.doubts = Doubts(self.setup, self.window, self.factors, self.settings.doubts)
-        self._rest = InitialRest(self.robot, self.grid, self.settings.gyro)
-        self._cycle = Cycle(self.factors, self.settings.output_rate)
+        if self._calibrator is not None:
+            self.health.corrected = {}
+            self.doubts.base.spread = self._calibrator.spread
 
     # -------------------------------------------------------------- measurements in, estimates out
 
@@ -91,6 +140,9 @@ class SlidingWindowFilter:
         Measurements that cannot be used are counted.
         """
         self.counts['received'][type(measurement).__name__] += 1
+        if self._calibrator is not None:
+            self._raw.append(measurement)
+        measurement = self._corrections.applied(measurement)
         estimate = self._step() if self._cycle.over(measurement) else None
         if self._admit(measurement) and self._cycle.complete(measurement):
             estimate = self._step()
@@ -161,6 +213,7 @@ class SlidingWindowFilter:
             self._rest.note(measurement)
             self.health.hear(getattr(measurement, 'sensor', ''), time)
         self.doubts.note(measurement, time, any(used))
+        self.start.note(measurement)
         return any(used)
 
     def _consumers(self, kind: type) -> list[Factor]:
@@ -200,7 +253,21 @@ class SlidingWindowFilter:
         with self._threads.limit(limits=1, user_api='blas'):
             # Small matrices: more threads only wait for one another.
             time = seconds(output, self.epoch)
-            return self._estimate(time, self._solve(time), started)
+            if self.start.pending and not self.recovery.acquired:
+                return self._locate(time)
+            outcome = self._solve(time)
+            told = not self.start.pending
+            self.start.watch(time, self.recovery.worst_share())
+            if told and self.start.pending:
+                self.recovery.lose()  # this last estimate says so
+            estimate = self._estimate(time, outcome, started) if told else None
+            self._calibrate(time)
+            return estimate
+
+    def _locate(self, time: float) -> None:
+        """Look for the base, and tell nothing."""
+        if self.start.due(time):
+            self.start.tried(time, *self.recovery.locate(self.start.bodies()))
 
     def _solve(self, time: float) -> tuple[int, bool]:
         if not self.recovery.acquired and len(self.window.columns) == 2 and not self.window.pinned:
@@ -221,6 +288,53 @@ class SlidingWindowFilter:
         self.recovery.look_after(time, outcome[1])
         self.history.note(self.window)
         return outcome
+
+    # ------------------------------------------------------- the robot itself, as it turns out
+
+    def _describe(self, robot: RobotDescription) -> None:
+        """Take what is measured from now on for that of a robot with other constants."""
+        self.setup.robot, self._corrections = robot, Corrections(robot)
+        self.priors.describe(robot)
+
+    def _new_calibrator(self) -> Calibrator | None:
+        self._raw: deque[Measurement] = deque()
+        if not self.settings.calibration.enabled:
+            return None
+        prior_map = self.setup.prior_map
+        middle = None if prior_map is None else prior_map.points.mean(axis=0)
+        parameters = Parameters(self.robot, middle=middle)
+        if parameters.size == 0:
+            return None
+        return Calibrator(parameters, self.window, self.settings.calibration)
+
+    def _calibrate(self, time: float) -> None:
+        """Read the window anew where the robot turned out to be another than it was taken for."""
+        if self._calibrator is None:
+            return
+        step = self._calibrator.due(time)
+        oldest = self.window.columns[0].time - TIME_EPSILON
+        while self._raw and seconds(self._raw[0].stamp, self.epoch) < oldest - MOST_CLOCK:
+            self._raw.popleft()
+        if step is None:
+            return
+        watch = self.settings.health
+        self._describe(self._calibrator.take(step).robot)
+        self.health.corrected = self._calibrator.late(watch.clock_offset, watch.clock_sigmas)
+        for factor in self.factors:
+            factor.describe(self.setup.robot)
+        for interval in self.window.intervals:
+            interval.clear()
+        for measurement in self._raw:
+            measurement = self._corrections.applied(measurement)
+            at = seconds(measurement.stamp, self.epoch)
+            if oldest <= at <= self.window.columns[-1].time + TIME_EPSILON:
+                self._enter_again(at, measurement)
+
+    def _enter_again(self, time: float, measurement: Measurement) -> None:
+        """Put a measurement that was counted before into its interval."""
+        for factor in self._consumers(type(measurement)):
+            with suppress(MeasurementError):
+                self.window.interval_at(time).add(factor, time, factor.row(measurement))
 
     def _guess(self) -> None:
         """Start from what the first samples tell of base and shape; straight without them."""
@@ -246,11 +360,13 @@ class SlidingWindowFilter:
         before, lagged, fit = now - self.settings.lag, None, fit_of(self.window.intervals)
         if self.settings.lag > 0.0 and before >= self.window.columns[0].time:
             lagged = self._compose(before, fit, outcome, started)
+        if self._loads is not None:
+            self._loads.look(now)
         return self._compose(now, fit, outcome, started, lagged)
 
     def _status(self) -> Status:
         """Say what to tell of the body; nothing but an undisputed fit is tracking."""
-        status = self.recovery.status
+        status = 'lost' if self.start.astray else self.recovery.status
         return 'doubtful' if status == 'tracking' and self.doubts.reasons else status
 
     def _rattle_covariance(self, time: float, s: np.ndarray) -> np.ndarray:
@@ -279,6 +395,8 @@ class SlidingWindowFilter:
         covariance = self.window.motion_covariance(time, rings)
         covariance[:, :6, :6] += self.recovery.doubt(self.grid.s[rings])
         covariance[:, :6, :6] += self._rattle_covariance(time, self.grid.s[rings])
+        if self._calibrator is not None:
+            covariance[:, :6, :6] += self._calibrator.spread(rings)
         covariance[1:, :6, :6] += np.diag(np.square(np.repeat(self.settings.calibration_sigma, 3)))
         T_map_frame, frame_covariance = self.window.frame(time)
         return Estimate(
@@ -301,4 +419,5 @@ class SlidingWindowFilter:
             lagged=lagged,
             T_map_frame=T_map_frame,
             frame_covariance=frame_covariance,
+            loads=self._loads.found if self._loads is not None else (),
         )

@@ -48,6 +48,7 @@ class Health:
     ):
         self.reasons: dict[str, str] = {}
         self.told: dict[str, str] = {}  # causes that were found otherwise
+        self.corrected: dict[str, float] | None = None  # clocks that are estimated [s]
         self.waiting = False  # for an explanation, before which nobody is accused of not fitting
         self._robot, self._window, self._factors, self._settings = robot, window, factors, settings
         self._heard: dict[str, float] = {}
@@ -68,7 +69,12 @@ class Health:
     @property
     def disbelieved(self) -> set[str]:
         """Suspects whose samples tell nothing of the body; noise alone the loss deals with."""
-        return {name for name, reason in self.reasons.items() if reason != NOISY}
+        corrected = self.corrected or ()
+        return {
+            name
+            for name, reason in self.reasons.items()
+            if reason != NOISY and not (name in corrected and reason == _late(corrected[name]))
+        }
 
     def hear(self, sensor: str, time: float) -> None:
         """Note that a sensor gave a usable sample at `time` [s]."""
@@ -97,14 +103,25 @@ class Health:
             cause = self._sights[name][1].cause if name in self._sights else ''
             known = name in self.disbelieved or bool(cause)
             if known or not waiting and (body_believed or name not in self._tof_names):
+<<<<<<< HEAD
                 reasons[name] = cause or MISFIT
         fits = alone and MISFIT not in reasons.values() and self._most_fit()
         if fits and not (body_doubted or self.waiting):
+=======
+                reasons[name] = MISFIT
+        if self.corrected is not None:
+            reasons |= {
+                name: _late(offset)
+                for name, offset in self.corrected.items()
+                if name not in reasons
+            }
+        elif not (body_doubted or self.waiting or MISFIT in reasons.values()):
+>>>>>>> main
             self._look_at_clocks(time)
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}
         for clock in self._late.values():
-            reasons.update(dict.fromkeys(clock.sensors, _lateness(clock)))
+            reasons.update(dict.fromkeys(clock.sensors, _late(clock.offset)))
         reasons.update(dict.fromkeys(self._silent(time), 'silent'))
         reasons.update(self.told)
         self.reasons = reasons
@@ -219,6 +236,6 @@ class Health:
             self._window.mark_changed()
 
 
-def _lateness(clock: ClockOffset) -> str:
-    side = 'late' if clock.offset < 0.0 else 'early'
-    return f'{1e3 * abs(clock.offset):.0f} ms {side}'
+def _late(offset: float) -> str:
+    """Say by how much a clock is off; offset: true time less stamp [s]."""
+    return f'{1e3 * abs(offset):.0f} ms {"late" if offset < 0.0 else "early"}'

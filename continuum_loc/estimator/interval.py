@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.factors import ClockScores, Factor, FactorReport
 from continuum_loc.estimator.normal import Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.state import Column
 import numpy as np
@@ -33,6 +35,12 @@ class Interval:
         self._times.setdefault(factor, []).append(time - self.start)
         self._rows.setdefault(factor, []).append(row)
         self._batches.pop(factor, None)
+        self.changed = True
+
+    def clear(self) -> None:
+        """Forget all rows, to be read anew; how they fitted is told until then."""
+        for kept in (self._times, self._rows, self._batches, self._scores):
+            kept.clear()
         self.changed = True
 
     def rows(self, factor: Factor) -> list[tuple]:
@@ -71,6 +79,17 @@ class Interval:
         if factor in self._batches and factor not in self._scores:
             self._scores[factor] = factor.clock_scores(self._batches[factor], a, b)
         return self._scores.get(factor)
+
+    def bordered(self, priors: Priors, a: Column, b: Column, of: Parameters) -> Border:
+        """Say what priors and measurements tell of the constants `of` the robot, linearised."""
+        dim = len(self.normal.g) // 2
+        border = Border.zeros(2 * dim, of.size)
+        newer = Border(border.C[dim:], border.H, border.g)
+        priors.bordered(newer, b, priors.share(b.time - a.time), of)
+        for factor, batch in self._batches.items():
+            factor.bordered(batch, a, b, border, of)
+        border.level(of.clocks)
+        return border
 
     def modelled_cost(self, offset_a: np.ndarray, offset_b: np.ndarray) -> float:
         """Cost that the quadratic model gives at offsets from the linearisation point."""

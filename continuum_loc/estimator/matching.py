@@ -185,6 +185,37 @@ def weigh(T, frame, weight, planes, rules, local, tally):
     return cost, squared, count
 
 
+@kernel
+def weigh_ranges(T, frame, weight, planes, rules, unit, local):
+    """
+    Write one frame's equations by the body's pose, and by offset and scale of its ranges.
+
+    unit: where the sensor is in the node's frame (3,), and 1 over the share of each zone's range
+    that it measures (Z,). What the map does not match is left out.
+    """
+    H, g, row, variance = local.H, local.g, np.empty(8), frame.variance
+    H[:, :] = 0.0
+    g[:] = 0.0
+    c2 = rules.cauchy * rules.cauchy
+    for z in range(variance.shape[0]):
+        hit = frame.hits[z]
+        if hit < 0 or not np.isfinite(variance[z]):
+            continue
+        r = _residual(T, frame.q, z, planes.rows, hit, row)
+        total = _spread(frame, z, row, rules) + planes.variance
+        cosine, distance = 0.0, 0.0
+        for i in range(3):
+            cosine += row[i] * frame.rays[z, i]
+            distance += (frame.q[z, i] - unit.origin[i]) * frame.rays[z, i]
+        row[6], row[7] = -cosine * unit.along[z], -cosine * distance
+        information = weight * planes.rows[hit, 6] / (1.0 + r * r / (total * c2)) / total
+        for i in range(8):
+            scaled = information * row[i]
+            g[i] += scaled * r
+            for j in range(8):
+                H[i, j] += scaled * row[j]
+
+
 @kernel(inline='always')
 def _residual(T, q, z, planes, hit, row):
     """Distance of zone z from the plane that it hit, and its derivative by the pose, row (6,)."""

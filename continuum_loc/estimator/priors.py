@@ -13,7 +13,9 @@ from typing import NamedTuple
 from continuum_loc import lie, lie_kernels
 from continuum_loc.compiling import kernel
 from continuum_loc.estimator import gp
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.normal import add_rows, Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import (
     Column,
@@ -60,6 +62,7 @@ class OfColumn(NamedTuple):
     rest_information: np.ndarray  # (6,)
     T_map_base: np.ndarray  # (4, 4)
     base_information: np.ndarray  # (2, 6) of the base's pose and of its velocity
+    base_reach: np.ndarray  # (6,) of its pose, with what it may be off by as built
 
 
 class OfFrame(NamedTuple):
@@ -104,9 +107,11 @@ class Priors:
         step_psd = np.square(prior.strain_step) / np.diff(grid.s)[:, None]
         self.strain_psd = np.array(prior.strain) + grid.steps[:, None] * step_psd
         self.T_map_base, self._base_information = _base_of(robot)
+        self._base_reach = self._reach_of(robot, settings)
         self._drifts = robot.base.measurement.drift > 0.0
         self._own_frame = self._drifts or robot.base.measurement.frame != 'map'
         self._of_frame, self._of_start = _frame_of(robot), _start_of(robot)
+        self._T_map_start = robot.base.T_map_base
         self._work = gp.new_workspace()
         self._bias_information = 1.0 / gyro.bias_sigma**2
         self._initial_velocity = np.repeat(1.0 / np.square(prior.initial_velocity_sigma), 3)
@@ -125,7 +130,24 @@ class Priors:
             1.0 / np.square(robot.backbone.rest_strain_sigma),
             self.T_map_base,
             self._base_information,
+            self._base_reach,
         )
+
+    def _reach_of(self, robot: RobotDescription, settings: EstimatorSettings) -> np.ndarray:
+        """Make `OfColumn.base_reach`."""
+        information = self._base_information[0]
+        if not settings.calibration.enabled or robot.base.mode != 'fixed':
+            return information
+        told = robot.tolerances
+        built = np.repeat([told.base_position, np.radians(told.base_rotation_deg)], 3)
+        return 1.0 / (1.0 / information + np.square(built))
+
+    def describe(self, robot: RobotDescription) -> None:
+        """Take the base and the rest strain of a robot with other constants (`parameters`)."""
+        self.T_map_base, _ = _base_of(robot)
+        self._T_map_start = robot.base.T_map_base
+        self.rest = np.array(robot.backbone.rest_strain)
+        self._of_column = self._of_column._replace(rest=self.rest, T_map_base=self.T_map_base)
 
     def let_go(self, loose: bool) -> bool:
         """
@@ -137,8 +159,10 @@ class Priors:
             return False
         self.velocity_psd = self._carried_psd if loose else self._held_psd
         self._in_time = self._in_time._replace(inverse_velocity_psd=1.0 / self.velocity_psd)
-        information = LET_GO * self._base_information if loose else self._base_information
-        self._of_column = self._of_column._replace(base_information=information)
+        share = LET_GO if loose else 1.0
+        self._of_column = self._of_column._replace(
+            base_information=share * self._base_information, base_reach=share * self._base_reach
+        )
         return True
 
     def start(
@@ -190,12 +214,33 @@ class Priors:
         strain and base pose are one observation per `memory`, not one per knot: a knot counts
         them by its share of that time.
         """
-        share, jerked = min((b.time - a.time) / self.memory, 1.0), np.empty(self.grid.nodes)
+        share, jerked = self.share(b.time - a.time), np.empty(self.grid.nodes)
         priors = self._in_time, self._of_column
         cost = _add(normal, a, b, *priors, share, jerked, self._work)
         if self.grid.frames:
             cost += _add_frame(normal, a, b, self._of_frame, self._work)
         return cost, jerked
+
+    def share(self, duration: float) -> float:
+        """Say what rest strain and base pose count by at a knot so long after another [s]."""
+        return min(duration / self.memory, 1.0)
+
+    def bordered(self, border: Border, column: Column, share: float, of: Parameters) -> None:
+        """Add what one column's own factors say of base and length; `border` is that column's."""
+        prior, nodes = self._of_column, self.grid.nodes
+        error = lie.log(lie.inverse(prior.T_map_base) @ column.T[0])
+        right, left = lie.right_jacobian_inverse(error), lie.left_jacobian_inverse(error)
+        back = lie.adjoint(lie.inverse(prior.T_map_base) @ self._T_map_start)
+        columns = of.columns('base', [''])[0]
+        W = np.diag(share * prior.base_information[0])
+        far = error @ (prior.base_reach * error)
+        W *= BASE_PLAIN / max(BASE_PLAIN, far)  # as `_add_base` lets it go
+        border.add(np.arange(6), right, columns, -left @ back, W, error)
+        rows = NODE_DIM * np.arange(nodes) + STRAIN
+        off = column.strain[:, 0] - prior.rest[0]
+        W = share * prior.rest_information[0] * np.eye(nodes)
+        by_length = np.full((nodes, 1), -prior.rest[0])
+        border.add(rows, np.eye(nodes), of.columns('length', [''])[0], by_length, W, off)
 
 
 def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
@@ -415,14 +460,14 @@ def _add_base(normal, column, prior, share, work):
     """
     at, velocity = work[0], column.velocity[0]
     lie_kernels.pose_error(prior.T_map_base, column.T[0], at.xi, at.right, at.scratch)
-    error, J, squared = at.xi.x, at.right, 0.0
+    error, J, squared, far = at.xi.x, at.right, 0.0, 0.0
     for i in range(6):
-        information = prior.base_information[0, i]
-        rate = prior.base_information[1, i]
-        squared += information * error[i] * error[i] + rate * velocity[i] * velocity[i]
-    if squared > BASE_PLAIN:
-        share *= BASE_PLAIN / squared
-        squared *= 1.0 + np.log(squared / BASE_PLAIN)
+        rate = prior.base_information[1, i] * velocity[i] * velocity[i]
+        squared += prior.base_information[0, i] * error[i] * error[i] + rate
+        far += prior.base_reach[i] * error[i] * error[i] + rate
+    if far > BASE_PLAIN:
+        share *= BASE_PLAIN / far
+        squared *= 1.0 + np.log(far / BASE_PLAIN)
     cost = share * squared
     for i in range(6):
         information = prior.base_information[0, i] * share

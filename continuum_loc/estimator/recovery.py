@@ -119,7 +119,7 @@ class Recovery:
         if self._tof is None or not self._settings.enabled:
             self.acquired = self.acquired or converged
             return
-        share = self._worst_share()
+        share = self.worst_share()
         fitting = share >= self._settings.suspect_share
         self.acquired = self.acquired or (converged and fitting)
         due = self._watch.update(time, share)
@@ -128,9 +128,9 @@ class Recovery:
             self._watch.searched(time, confirmed)
             if confirmed:
                 self._health.look(time, body_believed=True, body_doubted=True)
-        self._doubt = self._how_doubtful(self._worst_share())
+        self._doubt = self._how_doubtful(self.worst_share())
 
-    def _worst_share(self) -> float:
+    def worst_share(self) -> float:
         """
         Least share of fitting zones over the rings, in the newest interval with ToF frames.
 
@@ -187,6 +187,34 @@ class Recovery:
             self._refine()
         self.acquired = True
         return not any(self._rivals(one, chosen) for one in tries)
+
+    def locate(self, bodies: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[bool, np.ndarray]:
+        """
+        Try bodies, each a base (4, 4) and strain (N, 6), and take the best one.
+
+        Returns whether it is to be believed, as it fits and no other one does as well; and the
+        places (H, 4, 4) of the base that were tried, best first.
+        """
+        window = self._window
+        window.wandered = True
+        window.keep_newest(SEARCH_INTERVALS)
+        present, tries = window.columns[-1], []
+        for T_map_base, strain in bodies:
+            window.place(column_at_rest(window.grid, T_map_base, strain, *_known(present)))
+            tries.append(self._refine())
+        if not tries:
+            return False, np.empty((0, 4, 4))
+        tries.sort(key=_cost)
+        chosen = tries[0]
+        window.set_columns(chosen.columns)
+        self._refine()
+        alone = not any(self._rivals(one, chosen) for one in tries[1:])
+        self.acquired = alone and self.worst_share() >= self._settings.suspect_share
+        return self.acquired, np.array([one.columns[-1].T[0] for one in tries])
+
+    def lose(self) -> None:
+        """Say that the body is lost, until it is found again."""
+        self._watch.lost, self.acquired = True, False
 
     def _beats(self, other: Try, mine: Try, slack: float) -> bool:
         """

@@ -201,6 +201,12 @@ class MechanicsSettings(Settings):
         gt=0.0,
         description='scale of the Cauchy loss in sigmas: what touches something counts little',
     )
+    loads: bool = Field(True, description='whether forces are looked for')
+    load_period: float = Field(0.1, ge=0.0, description='least time between two looks [s]')
+    load_evidence: float = Field(
+        15.0, gt=0.0, description='by how much a force has to lower the misfit to be told (chi2)'
+    )
+    least_force: float = Field(0.2, ge=0.0, description='a weaker force is not told [N]')
 
 
 class SolverSettings(Settings):
@@ -317,6 +323,35 @@ class DoubtSettings(Settings):
     )
 
 
+class CalibrationSettings(Settings):
+    """Estimating what the robot departs from its description by, within its tolerances."""
+
+    enabled: bool = Field(
+        True, description='whether constants of the robot are taken for uncertain at all'
+    )
+    online: bool = Field(
+        True,
+        description='whether they are estimated while it moves; else they only spread the '
+        'covariance, as befits a robot that was calibrated',
+    )
+    period: float = Field(
+        1.0, gt=0.0, description='time between two changes of what measurements are taken for [s]'
+    )
+    drift: float = Field(
+        3600.0,
+        gt=0.0,
+        description='time in which a constant may wander off by its tolerance: a mount that is '
+        'knocked, a sensor that warms up [s]',
+    )
+    least: float = Field(
+        0.5,
+        ge=0.0,
+        le=1.0,
+        description='share of its tolerance down to which a constant can be known: what the model '
+        'misses does not average out',
+    )
+
+
 class EstimatorSettings(Settings):
     """The sliding-window filter."""
 
@@ -353,6 +388,7 @@ class EstimatorSettings(Settings):
     recovery: RecoverySettings = RecoverySettings()
     health: HealthSettings = HealthSettings()
     doubts: DoubtSettings = DoubtSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
 
 
 def settings_of(robot_name: str, given: str | Path | None = None) -> EstimatorSettings:

@@ -9,6 +9,7 @@ the window moves on; the point at which that happened is pinned (first-estimate 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 
@@ -26,6 +27,9 @@ from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid, TIME_EPSILON
 import numpy as np
+
+# Told of an interval, its columns and the chain before the older column is marginalised.
+Forgetting = Callable[[Interval, Column, Column, Chain], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +59,7 @@ class Window:
         self.offsets: list[np.ndarray] = []
         self.intervals: list[Interval] = []
         self.chain: Chain | None = None
+        self.on_forgetting: Forgetting | None = None
         self.pinned = self._moving = False
         self._bias: tuple[np.ndarray, np.ndarray] | None = None
         self._first: Column | None = None  # what the prior of the start is about
@@ -89,7 +94,10 @@ class Window:
         changed = oldest.changed
         if changed:
             oldest.linearise(self.priors, self.columns[0], self.columns[1])
-        self.chain.forget_oldest(oldest.normal, changed)
+        self.chain.make_oldest_ready(oldest.normal, changed)
+        if self.on_forgetting is not None:
+            self.on_forgetting(oldest, self.columns[0], self.columns[1], self.chain)
+        self.chain.forget_oldest()
         del self.columns[0], self.offsets[0], self.intervals[0]
         self.pinned = True
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 import json
 from pathlib import Path
@@ -82,6 +82,14 @@ class PriorMap:
     def index(self) -> VoxelIndex:
         """Nearest-neighbour index, made once for all users; its rows are rows of this map."""
         return VoxelIndex(self.points, self.normals)
+
+    def moved(self, T: np.ndarray) -> PriorMap:
+        """Move every point and normal by T (4, 4)."""
+        return replace(
+            self,
+            points=self.points @ T[:3, :3].T + T[:3, 3],
+            normals=self.normals @ T[:3, :3].T,
+        )
 
     def save(self, path: str | Path) -> None:
         """

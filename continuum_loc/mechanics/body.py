@@ -24,19 +24,19 @@ class TendonBody:
     The body of a robot with an `actuation` block, cut where tendons and modules end.
 
     Without weight bending is constant between them, so that a stretch is one element; with weight
-    an element is no longer than a twelfth of the body. s: (N,) middles of the elements [m].
+    an element is no longer than a twelfth of the body. Or it is cut at `cuts` (N + 1,) [m], and an
+    element is of the stretch that its middle lies in. s: (N,) middles of the elements [m].
     """
 
-    def __init__(self, robot: RobotDescription) -> None:
+    def __init__(self, robot: RobotDescription, cuts: np.ndarray | None = None) -> None:
         block = robot.actuation
         self.actuation, self.T_map_base = block, robot.base.T_map_base
         ends = block.stretches(robot.length, robot.backbone.module_ends)
-        cuts = np.concatenate([[0.0], ends])
-        longest = robot.length * (MOST_ELEMENT if any(block.weight) else 1.0)
-        parts = np.ceil(np.diff(cuts) / longest - 1e-9).astype(int)
-        spans = np.repeat(np.diff(cuts) / parts, parts)
-        self.s = np.cumsum(spans) - 0.5 * spans
-        self.rod = _rod(block, spans, np.repeat(np.arange(len(parts)), parts))
+        if cuts is None:
+            cuts = _cuts(ends, robot.length * (MOST_ELEMENT if any(block.weight) else 1.0))
+        spans = np.diff(cuts)
+        self.s = 0.5 * (cuts[1:] + cuts[:-1])
+        self.rod = _rod(block, spans, np.searchsorted(ends, self.s - 1e-9))
         self.tendons = _tendons(block, spans)
         self.load = Load(*no_load(len(spans))[:2], np.array(block.weight))
 
@@ -72,6 +72,17 @@ class BodyState:
         if reached:
             slide(body.rod, self.strain, self._memory)
         return bool(reached)
+
+
+def _cuts(ends: np.ndarray, longest: float) -> np.ndarray:
+    """(N + 1,) arclengths that cut stretches which end at `ends` into pieces of equal length."""
+    edges = np.concatenate([[0.0], ends])
+    parts = np.ceil(np.diff(edges) / longest - 1e-9).astype(int)
+    pieces = [
+        np.linspace(a, b, count, endpoint=False)
+        for a, b, count in zip(edges, ends, parts, strict=False)
+    ]
+    return np.concatenate([*pieces, ends[-1:]])
 
 
 def _rod(block: Actuation, spans: np.ndarray, stretch: np.ndarray) -> Rod:

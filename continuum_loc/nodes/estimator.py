@@ -5,19 +5,26 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 import sys
-import time
 from typing import Any
 
-from continuum_loc.errors import MessageError
+from continuum_loc.errors import FrameError, MessageError, SettingsError
 from continuum_loc.estimate import Estimate
 from continuum_loc.estimator import EstimatorSettings, settings_of, SlidingWindowFilter
 from continuum_loc.estimator.settings import PRESETS_FOLDER
 from continuum_loc.mapping.prior_map import PriorMap
-from continuum_loc.measurements import EncoderSample, Measurement, nanoseconds, TofFrame
+from continuum_loc.measurements import (
+    BaseSample,
+    EncoderSample,
+    Measurement,
+    nanoseconds,
+    TofFrame,
+)
 from continuum_loc.nodes.support import parameters
 from continuum_loc.nodes.support.body import body_message, ring_records, ring_topics
 from continuum_loc.nodes.support.frames import FrameTree
 from continuum_loc.nodes.support.memory import RecentPoses, SeenScene
+from continuum_loc.nodes.support.placing import is_planar, placed_base, raised, with_base
+from continuum_loc.nodes.support.progress import compiling
 from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import EstimatorNodeSettings
 from continuum_loc.nodes.support.transforms import (
@@ -30,15 +37,13 @@ from continuum_loc.nodes.support.warm_up import warm_up
 from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
 from continuum_loc.robot import RobotDescription
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from msg_tools.convert import tracked_pose
 from msg_tools.factory import ros_messages
 from msg_tools.geometry import MAP
-from msg_tools.records import CloudRecord
+from msg_tools.records import CloudRecord, PosesRecord
 from msg_tools.results import columns_message, map_record, tip_message
 from msg_tools.topics import INPUTS, tip_of, TRACKER
 import numpy as np
 from rclpy.qos import QoSProfile
-from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
 FILTER = 'filter.'
@@ -65,12 +70,14 @@ class EstimatorNode(WorkerNode):
         self.body: Any = None
         self._insertion = 0.0
         self._scene_published = 0
+        self._told_base = 0  # stamp of the newest pose of the base that was taken from /tf
+        self._hypotheses: Any = None
 
     # ------------------------------------------------ life
 
     def prepare(self) -> None:
         """Load the map, compile the filter, offer services and outputs."""
-        self.prior_map = self._load_map()
+        self.prior_map = self._load_map(self.settings.map)
         self.scene = SeenScene(self.robot, self.prior_map, self.settings.reconstruction_seconds)
         self.filter = self._new_filter(self.robot)
         self.estimate = None
@@ -83,6 +90,13 @@ class EstimatorNode(WorkerNode):
                 'no TF: tf2_msgs is not installed (apt install ros-jazzy-tf2-msgs)'
             )
         topics = ('poses', 'backbone', 'tip', 'reconstruction', *ring_topics(self.robot))
+        base = self.robot.base
+        if base.mode == 'measured':
+            topics += ('base/frame', *(['base/pose'] if self.settings.base_tf else []))
+        if base.mode == 'free' and base.region[0] > 0.0:
+            topics += ('base/hypotheses',)
+        if self.robot.actuation is not None:
+            topics += ('load',)
         for topic in topics:
             self.publisher(topic)
         markers = ros_messages().resolve('visualization_msgs/msg/MarkerArray')
@@ -95,6 +109,8 @@ class EstimatorNode(WorkerNode):
             self.tf.send_fixed()
             listen_to_frames(self, self.tree)
         super().activate()
+        if self.settings.base_tf:
+            self.every(1.0 / self.robot.base.measurement.rate, self._tell_base)
 
     # ------------------------------------------------ the filter (worker thread)
 
@@ -105,10 +121,32 @@ class EstimatorNode(WorkerNode):
         if isinstance(measurement, EncoderSample) and 'insertion' in measurement.names:
             self._insertion = float(measurement.position[measurement.names.index('insertion')])
         estimate = self.filter.process(measurement)
+        self._publish_hypotheses(measurement.stamp)
         if estimate is None:
             return None
         self._publish(estimate)
         return estimate.stamp
+
+    def _tell_base(self) -> None:
+        """Put what /tf newly says of the base onto `base/pose`, where it is heard and recorded."""
+        frame, carrier = self.robot.base.measurement.frame, self.settings.base_tf
+        stamp = self.tree.latest(frame, carrier)
+        if stamp is None or stamp <= self._told_base:
+            return
+        try:
+            T_frame_base = self.tree.transform(frame, carrier, stamp)
+        except FrameError as error:
+            self.get_logger().warning(f'base_tf: {error}', throttle_duration_sec=10.0)
+            return
+        self._told_base = stamp
+        self.publish('base/pose', BaseSample(stamp, frame, T_frame_base))
+
+    def _publish_hypotheses(self, stamp: int) -> None:
+        """Publish where the base may be, whenever a search has found other places."""
+        found = self.filter.start.hypotheses
+        if found is not self._hypotheses and len(found):
+            self.publish('base/hypotheses', PosesRecord(stamp, found))
+        self._hypotheses = found
 
     def idle(self) -> bool:
         """Place what the ToF sensors saw an instant ago, and publish it when it is due."""
@@ -130,7 +168,9 @@ class EstimatorNode(WorkerNode):
         """Lost and doubtful are errors; starting, suspects, what nothing observes are warnings."""
         estimate = self.estimate
         if estimate is None:
-            return WARN, 'no estimate yet', {}
+            places = len(self.filter.start.hypotheses) if self.filter is not None else 0
+            looked = f': {places} places fit, move on' if places > 1 else ''
+            return WARN, f'no estimate yet{looked}', {}
         inliers = (
             float(np.mean(list(estimate.inliers.values()))) if estimate.inliers else float('nan')
         )
@@ -184,6 +224,8 @@ class EstimatorNode(WorkerNode):
         self.publish('backbone', estimate)
         if estimate.T_map_frame is not None:
             self.publish('base/frame', estimate)
+        if self.robot.actuation is not None:
+            self.publish('load', estimate)
         if self.tf is not None:
             self.tf.send(estimate.stamp, estimate.T_map_ring, estimate.T_map_frame)
         self.recent.add(estimate)
@@ -217,20 +259,26 @@ class EstimatorNode(WorkerNode):
     def _offer_services(self) -> None:
         for name, action in (
             ('reset', self._reset),
+            ('clear_faults', self._clear_faults),
             ('save_map', self._save_map),
             ('save_trajectory', self._save_trajectory),
         ):
             self.serve(Trigger, f'~/{name}', partial(_answer, action))
-        self.listen(
-            'geometry_msgs/msg/PoseWithCovarianceStamped',
-            'initialpose',
-            self._initial_pose,
-            QoSProfile(depth=10),
-        )
+        for topic in ('initialpose', 'set_pose'):
+            self.listen(
+                'geometry_msgs/msg/PoseWithCovarianceStamped',
+                topic,
+                partial(self._place, topic),
+                QoSProfile(depth=10),
+            )
 
     def _reset(self) -> str:
         self.in_worker(lambda: self._rebuild(self.robot))
         return 'the estimate starts anew with the next sample'
+
+    def _clear_faults(self) -> str:
+        self.in_worker(lambda: self.filter.forget_faults())
+        return 'every sensor is believed again, until it is found out anew'
 
     def _save_map(self) -> str:
         path = self._output('reconstruction.ply')
@@ -251,16 +299,23 @@ class EstimatorNode(WorkerNode):
         folder.mkdir(parents=True, exist_ok=True)
         return folder / name
 
-    def _initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Take the base's present pose, as RViz's tool gives it, and start the estimate anew."""
+    def _place(self, topic: str, message: PoseWithCovarianceStamped) -> None:
+        """
+        Take the base's present pose, in any frame, and start the estimate anew.
+
+        On `initialpose` a planar one, as RViz's tool gives it, has no height.
+        """
+        planar = topic == 'initialpose' and is_planar(message)
         try:
-            pose = tracked_pose(message, 'base', 'initialpose')
-        except MessageError as error:
-            self.intake.refuse(error.kind, str(error))
+            pose = placed_base(message, self.frames.map, self.tree)
+        except (MessageError, FrameError) as error:
+            self.intake.refuse(getattr(error, 'kind', 'frame'), f'{topic}: {error}')
             return
-        robot = with_base(self.robot, pose.T_map_sensor, pose.covariance, self._insertion)
+        T_map_base = raised(self.robot, pose.T_map_sensor) if planar else pose.T_map_sensor
+        robot = with_base(self.robot, T_map_base, pose.covariance, self._insertion)
         self.in_worker(partial(self._rebuild, robot))
-        self.get_logger().info('initialpose: the estimate starts anew from this base')
+        kept = ', at the height, roll and pitch of the robot description' if planar else ''
+        self.get_logger().info(f'{topic}: the estimate starts anew from this base{kept}')
 
     def _change(self, values: dict[str, Any]) -> str | None:
         """Filter settings take effect at once, by a new start; the rest is as for every node."""
@@ -271,11 +326,30 @@ class EstimatorNode(WorkerNode):
             )
             if self.filter is not None:
                 self.in_worker(lambda: self._rebuild(self.robot))
+        if 'map' in values:
+            self._change_map(values['map'])
         rest = {name: value for name, value in values.items() if name not in mine}
         reason = super()._change(rest) if rest else None
         if self.scene is not None:
             self.scene.duration = self.settings.reconstruction_seconds
         return reason
+
+    def _change_map(self, path: str) -> None:
+        """Match to another map from now on; raises MapError or SettingsError where it cannot."""
+        if not path:
+            raise SettingsError("parameter 'map': it can be changed while running, not taken away")
+        if self.filter is None:
+            return  # it is loaded when the node is configured
+        prior = self._load_map(path)
+        prior.index  # noqa: B018  (made here, so that the worker need not)
+        self.in_worker(partial(self._use_map, prior))
+
+    def _use_map(self, prior: PriorMap) -> None:
+        self.prior_map = prior
+        self.filter.use_map(prior)
+        self.scene = SeenScene(self.robot, prior, self.settings.reconstruction_seconds)
+        self._publish_map()
+        self.get_logger().info(f'another map: {len(prior)} points; shape and biases stay')
 
     def _rebuild(self, robot: RobotDescription) -> None:
         self.robot = robot
@@ -299,48 +373,21 @@ class EstimatorNode(WorkerNode):
             )
         return settings_of(self.robot.name, self.settings.settings)
 
-    def _load_map(self) -> Any:
-        if not self.settings.map:
+    def _load_map(self, path: str) -> PriorMap | None:
+        if not path:
             self.get_logger().warning('no prior map: ToF sensors cannot be used (parameter `map`)')
             return None
         from continuum_loc.mapping.scale import map_for
 
-        prior = map_for(self.robot, self.settings.map)
+        prior = map_for(self.robot, path)
         for note in prior.notes:
-            self.get_logger().warning(f'{self.settings.map}: {note}')
+            self.get_logger().warning(f'{path}: {note}')
         return prior
 
     def _warm_up(self) -> None:
         if self.settings.warm_up:
-            self.get_logger().info('compiling, or loading what an earlier run compiled')
-            begin = time.monotonic()
-            warm_up(self.robot, self.prior_map, self.filter_settings, self.scene)
-            self.get_logger().info(f'compiled or loaded in {time.monotonic() - begin:.1f} s')
-
-
-def with_base(
-    robot: RobotDescription, T_map_base: np.ndarray, covariance: np.ndarray, insertion: float
-) -> RobotDescription:
-    """
-    Move the robot's base to a pose (4, 4) given at the present insertion [m].
-
-    A covariance of zeros keeps the robot's own.
-    """
-    T_base_zero = np.eye(4)
-    T_base_zero[0, 3] = -insertion
-    T_map_zero = T_map_base @ T_base_zero
-    rpy = Rotation.from_matrix(T_map_zero[:3, :3]).as_euler('xyz', degrees=True)
-    change: dict[str, Any] = {
-        'xyz': tuple(T_map_zero[:3, 3].tolist()),
-        'rpy_deg': tuple(rpy.tolist()),
-    }
-    if covariance.any():
-        change['sigma_position'] = float(max(np.sqrt(np.trace(covariance[:3, :3]) / 3.0), 1e-6))
-        change['sigma_rotation_deg'] = float(
-            max(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]) / 3.0)), 1e-6)
-        )
-    base = type(robot.base).model_validate(robot.base.model_dump() | change)
-    return type(robot).model_validate(robot.model_dump() | {'base': base.model_dump()})
+            with compiling(self.get_logger().info):
+                warm_up(self.robot, self.prior_map, self.filter_settings, self.scene)
 
 
 def _verdict(estimate: Estimate, suspects: str, least_known: str) -> tuple[int, str]:

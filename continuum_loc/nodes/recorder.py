@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from datetime import datetime
 from functools import partial
+from pathlib import Path
 from queue import Empty, Queue
 import sys
 import threading
 import time
 from typing import Any
 
-from continuum_loc.errors import SettingsError
+from continuum_loc.errors import LiveError, SettingsError
 from continuum_loc.nodes.support.managed import PackageNode
 from continuum_loc.nodes.support.quality import input_qos
 from continuum_loc.nodes.support.runtime import run, write_summary
@@ -143,6 +144,24 @@ class RecorderNode(PackageNode):
             if time.monotonic() - flushed > FLUSHED:
                 self.bag.flush()
                 flushed = time.monotonic()
+
+
+def record_for(seconds: float, bag: Path, namespace: str = '') -> None:
+    """
+    Record what a namespace says for some seconds; blocks meanwhile.
+
+    Raises LiveError where that fails.
+    """
+
+    class Limited(RecorderNode):
+        def activate(self) -> None:
+            super().activate()
+            self.every(seconds, self.finish)
+
+    space = f'/{namespace.strip("/")}'
+    code = run(Limited, ['--ros-args', '-p', f'bag:={bag}', '-r', f'__ns:={space}'])
+    if code != 0:
+        raise LiveError('the graph could not be recorded')
 
 
 def main(args: list[str] | None = None) -> None:

@@ -10,6 +10,7 @@ import sys
 from typing import Any
 
 from continuum_loc.measurements import BaseSample, Measurement
+from continuum_loc.nodes.support.progress import compiling
 from continuum_loc.nodes.support.runtime import run
 from continuum_loc.nodes.support.settings import ShapeNodeSettings
 from continuum_loc.nodes.support.worker import ERROR, OK, WARN, WorkerNode
@@ -42,8 +43,8 @@ class ShapeNode(WorkerNode):
             else ShapeSettings()
         )
         self.estimator, self.estimate = ShapeEstimator(self.robot, chosen), None
-        self.get_logger().info('compiling, or loading what an earlier run compiled')
-        rehearse(self.robot, chosen)
+        with compiling(self.get_logger().info):
+            rehearse(self.robot, chosen)
         for topic in ('shape/poses', 'shape/curve'):
             self.publisher(topic)
         self.serve(Trigger, '~/reset', self._reset)

@@ -11,6 +11,7 @@ import hashlib
 import os
 from pathlib import Path
 
+from continuum_loc import lie
 from continuum_loc.closure import digest_of_code
 from continuum_loc.mapping.build import local_shape
 from continuum_loc.mapping.map_files import load_map
@@ -73,16 +74,21 @@ def _scan(prior: PriorMap, scan: Scan, rng: np.random.Generator) -> PriorMap:
     )
 
 
+def T_map_scene(prior: PriorMap, departures: Departures, seed: int) -> np.ndarray:
+    """(4, 4) from the scene's frame to that of the map that is made of it, `prior` being exact."""
+    if not departures.map_frame:
+        return np.eye(4)
+    if departures.scan:
+        prior = _scan(prior, departures.scan, stream_of(seed, 'scan'))
+    return _about_middle(prior, departures.map_frame.drawn(stream_of(seed, 'map_frame')))
+
+
 def _moved(prior: PriorMap, T: np.ndarray) -> PriorMap:
     """Turn the map about its middle, and shift it."""
-    middle = prior.points.mean(axis=0)
-    return PriorMap(
-        (prior.points - middle) @ T[:3, :3].T + middle + T[:3, 3],
-        prior.normals @ T[:3, :3].T,
-        prior.planarity,
-        sigma=prior.sigma,
-        spacing=prior.spacing,
-        oriented=prior.oriented,
-        source=prior.source,
-        seed=prior.seed,
-    )
+    return prior.moved(_about_middle(prior, T))
+
+
+def _about_middle(prior: PriorMap, T: np.ndarray) -> np.ndarray:
+    middle = np.eye(4)
+    middle[:3, 3] = prior.points.mean(axis=0)
+    return middle @ T @ lie.inverse(middle)

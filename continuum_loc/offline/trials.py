@@ -15,6 +15,7 @@ import shutil
 from typing import Any, TYPE_CHECKING
 
 from continuum_loc import lie
+from continuum_loc.errors import SettingsError
 from continuum_loc.measurements import Measurement, TruthSample
 from continuum_loc.robot import load_robot, RobotDescription
 import numpy as np
@@ -36,6 +37,16 @@ NOWHERE = 'none'  # a scene of empty space, without ToF frames
 BASES: dict[str, dict[str, Any]] = {
     'fixed': {'mode': 'fixed'},
     'measured': {
+        'mode': 'measured',
+        'sigma_position': 0.001,
+        'sigma_rotation_deg': 0.2,
+        'measurement': {
+            'sigma_position': 0.0002,
+            'sigma_rotation_deg': 0.02,
+            'latency': 0.010,
+        },
+    },
+    'untold latency': {
         'mode': 'measured',
         'sigma_position': 0.001,
         'sigma_rotation_deg': 0.2,
@@ -116,7 +127,7 @@ class Trial:
                 + ['drawn'] * self.drawn_base
                 + [f'world_{_world_name(self.world)}'] * (self.world != 'ideal')
                 + [Path(self.plant or '').stem] * bool(self.plant)
-                + [f'{self.carried}_{self.told}'] * bool(self.carried)
+                + [f'{Path(self.carried).stem}_{self.told}'] * bool(self.carried)
             )
             + f'-{self.seed}{length}'
         )
@@ -124,7 +135,7 @@ class Trial:
     @property
     def name(self) -> str:
         """Name the trial, uniquely among trials."""
-        base = f'-base_{self.base}' * bool(self.base)
+        base = f'-base_{self.base}'.replace(' ', '_') * bool(self.base)
         return f'{Path(self.map_scene or self.scene).stem}-map-{self.recording}{base}'
 
     @property
@@ -177,12 +188,22 @@ def with_base(robot: RobotDescription, name: str) -> RobotDescription:
 
 
 def _carried(trial: Trial, robot: RobotDescription, faults: tuple) -> World:
-    """Make the world of a trial on a base that is carried, and tells where it is."""
+    """
+    Make the world of a trial on a base that is carried, and tells where it is.
+
+    Raises SettingsError for what cannot be had together, or is unknown.
+    """
     from continuum_loc.simulator.carrier import carrier, Told
     from continuum_loc.simulator.scenes import load_scene
     from continuum_loc.simulator.world import World
 
-    robot = with_base(robot, 'odometry' if trial.told == 'odometry' else 'measured')
+    if trial.told not in TOLD:
+        raise SettingsError(f"no '{trial.told}' tells of a base; give one of {', '.join(TOLD)}")
+    if trial.disturbed or trial.drawn_base or trial.world != 'ideal':
+        raise SettingsError('a base is carried in the ideal world alone')
+    if robot.base.mode != 'measured':
+        robot = with_base(robot, 'odometry' if trial.told == 'odometry' else 'measured')
+    own = Path(trial.carried).suffix in ('.yaml', '.yml')  # which says itself what is told
     return World(
         robot,
         load_scene(trial.scene) if robot.tof and trial.scene != NOWHERE else None,
@@ -192,7 +213,7 @@ def _carried(trial: Trial, robot: RobotDescription, faults: tuple) -> World:
         tof_fidelity=trial.fidelity,
         seed=trial.seed,
         faults=faults,
-        carried=carrier(trial.carried, robot, Told(**TOLD[trial.told])),
+        carried=carrier(trial.carried, robot, None if own else Told(**TOLD[trial.told])),
     )
 
 

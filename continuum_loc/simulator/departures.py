@@ -14,7 +14,7 @@ from typing import Literal
 import zlib
 
 from continuum_loc.errors import SettingsError
-from continuum_loc.robot import Base, RobotDescription
+from continuum_loc.robot import based, RobotDescription
 from continuum_loc.settings import load_bundled, Settings
 from continuum_loc.simulator.departing_sensors import (
     Backlash,
@@ -197,13 +197,6 @@ def true_robot(robot: RobotDescription, departures: Departures, seed: int) -> Ro
         moved = robot.base.T_map_base @ departures.base.drawn(stream_of(seed, 'base'))
         robot = robot.model_copy(update={'base': based(robot.base, moved)})
     return robot
-
-
-def based(base: Base, T_map_base: np.ndarray) -> Base:
-    """Move a base."""
-    rpy_deg = Rotation.from_matrix(T_map_base[:3, :3]).as_euler('xyz', degrees=True)
-    moved = {'xyz': tuple(T_map_base[:3, 3].tolist()), 'rpy_deg': tuple(rpy_deg.tolist())}
-    return Base(**{**base.model_dump(), **moved})
 
 
 def true_plant(plant: PlantSettings, departures: Departures, seed: int) -> PlantSettings:

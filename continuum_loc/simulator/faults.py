@@ -32,9 +32,8 @@ from continuum_loc.measurements import (
     TofFrame,
     TruthSample,
 )
-from continuum_loc.robot import Mount, RobotDescription, Sensor
+from continuum_loc.robot import mounted, RobotDescription, Sensor
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 def source(sample: Any) -> str:
@@ -218,14 +217,9 @@ def miscalibrated(
         if not any(fnmatchcase(sensor.name, pattern) for pattern in sensors):
             return sensor
         return sensor.model_copy(
-            update={'mount': _mount(sensor.mount.T_ring_sensor @ lie.exp(error))}
+            update={'mount': mounted(sensor.mount.T_ring_sensor @ lie.exp(error))}
         )
 
     kinds = ('tof', 'imu', 'hall', 'trackers')
     groups = {kind: tuple(moved(sensor) for sensor in getattr(robot, kind)) for kind in kinds}
     return robot.model_copy(update=groups)
-
-
-def _mount(T_ring_sensor: np.ndarray) -> Mount:
-    rpy = Rotation.from_matrix(T_ring_sensor[:3, :3]).as_euler('xyz', degrees=True)
-    return Mount(xyz=tuple(T_ring_sensor[:3, 3].tolist()), rpy_deg=tuple(rpy.tolist()))

@@ -62,7 +62,7 @@ class Vl53l5cxSettings(Settings):
         5.0, ge=0.0, description='sigma of these, in sigmas of Table I (flights)'
     )
     wide_pulse: float = Field(
-        0.072, gt=0.0, description='spread of depth in a zone that earns status 9 [m] (flights)'
+        0.076, gt=0.0, description='spread of depth in a zone that earns status 9 [m] (flights)'
     )
     range_offset: float = Field(
         0.008, ge=0.0, description='offset per unit, 1 sigma [m] (datasheet: within 15 mm)'

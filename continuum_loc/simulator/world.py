@@ -22,6 +22,7 @@ from continuum_loc.measurements import Measurement, NANOSECONDS, TruthSample
 from continuum_loc.robot import RobotDescription, Sensor
 from continuum_loc.simulator import sensors as models
 from continuum_loc.simulator.carrier import BaseTeller, Carrier, carrier, JOINTS
+from continuum_loc.simulator.forces import contact_forces, Push, push
 from continuum_loc.simulator.model import (
     advance,
     build_model,
@@ -79,6 +80,7 @@ class World:
     T_magnet_true: (4, 4), where the magnet sits in the frame where it should; None: there.
     faults: wrappers of `faults`, applied to the stream in order.
     carried: what carries the base, a name of `carrier.carrier` or a Carrier; None: it stands.
+    pushes: forces from outside.
     """
 
     def __init__(
@@ -95,6 +97,7 @@ class World:
         seed: int = 0,
         faults: tuple = (),
         carried: Carrier | str | None = None,
+        pushes: tuple[Push, ...] = (),
     ) -> None:
         self.robot, self.scene, self.seed, self.faults = robot, scene, seed, faults
         self.plant = plant if isinstance(plant, PlantSettings) else _plant(plant, robot)
@@ -109,6 +112,7 @@ class World:
         supported = self.trajectory.supported
         model = build_model(robot, self.plant, scene, profile, supported, self.carried)
         self.body = _Body(robot, self.plant, model, self.trajectory, self.carried)
+        self.body.pushes = pushes, self.nodes_s
         self.motion = Motion()
         if scene is not None:
             from continuum_loc.simulator.placement import check_start
@@ -332,6 +336,7 @@ class _Body:
         mujoco.mj_forward(model, self.data)
         self.straight_length = self.data.ten_length.copy()
         self._steps = 0
+        self.pushes: tuple[tuple[Push, ...], np.ndarray] = (), np.empty(0)
 
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
         """Places (N, 3) of the nodes of the straight robot, and how deep each touches (N,) [m]."""
@@ -380,6 +385,10 @@ class _Body:
         self._steps += 1
         return self._state(time)
 
+    def contact_forces(self) -> np.ndarray:
+        """(N + 1, 3) forces [N] in the map by which contacts push the nodes at present."""
+        return contact_forces(self.model, self.data, self._nodes)
+
     def penetration(self) -> float:
         """Depth of the deepest contact at present [m], 0 where nothing touches."""
         return max(0.0, -float(self.data.contact.dist.min())) if self.data.ncon else 0.0
@@ -391,6 +400,8 @@ class _Body:
             value, rate = self._carried.command(time)
             drive = [*(value + self._lead * rate), *drive]
         self.data.ctrl[:] = np.append(drive, command.tension)
+        if self.pushes[0]:
+            push(self.data, self._nodes, self.pushes[1], self.pushes[0], time)
 
     def _state(self, time: float) -> State:
         data = self.data

@@ -18,23 +18,30 @@ from typing import Any, ClassVar, NamedTuple
 
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.matching import Surface, surface_of
 from continuum_loc.estimator.normal import Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid
+from continuum_loc.mapping.distances import DistanceField
 from continuum_loc.mapping.prior_map import PriorMap
 from continuum_loc.robot import RobotDescription
 import numpy as np
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Setup:
-    """What factors are made from; the map's lookup and surface are made once, when asked for."""
+    """What factors are made from; the map's surface and distances are made once, when asked."""
 
     robot: RobotDescription
     grid: Grid
     settings: EstimatorSettings
     prior_map: PriorMap | None = None
+
+    @cached_property
+    def distances(self) -> DistanceField:
+        return DistanceField.of(self.prior_map)
 
     @cached_property
     def surface(self) -> Surface:
@@ -119,6 +126,10 @@ class Factor(ABC):
         """Whether a filter of this setup has such a factor: unless its settings switch it off."""
         return getattr(getattr(setup.settings, cls.name, None), 'enabled', True)
 
+    def describe(self, robot: RobotDescription) -> None:
+        """Read measurements as those of a robot with other constants (`parameters`)."""
+        self.robot = robot
+
     @abstractmethod
     def row(self, measurement: Any) -> tuple:
         """
@@ -138,6 +149,9 @@ class Factor(ABC):
     def clock_scores(self, batch: tuple, a: Column, b: Column) -> ClockScores | None:
         """Say how the cost depends on the sensors' clocks; None where that is not asked for."""
         return None
+
+    def bordered(self, batch: tuple, a: Column, b: Column, border: Border, of: Parameters) -> None:  # noqa: B027
+        """Add what the measurements say of the constants `of` the robot to their border."""
 
     def awaited(self) -> bool:
         """Whether the first guess of the body is a poor one without this kind of sample."""
@@ -159,6 +173,9 @@ class Factor(ABC):
         before = self.weights
         self.weights = np.array([weight if name in doubted else 1.0 for name in self.sensors])
         return not np.array_equal(before, self.weights)
+
+    def use_map(self, setup: Setup, rows: list[tuple]) -> None:  # noqa: B027
+        """Match to the map of `setup` from now on, and what is in these rows anew."""
 
     def loosen(self, iteration: int) -> bool:
         """

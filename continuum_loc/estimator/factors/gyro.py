@@ -101,6 +101,13 @@ class GyroFactor(Factor):
         judge(batch.times, batch.imus, residuals, self.information, fits, rattle)
         return FactorReport(cost, squared, residuals.size, fits, rattle)
 
+    def bordered(self, batch, a, b, border, of):
+        columns = np.hstack(
+            [of.columns(kind, self.sensors) for kind in ('gyro', 'clock', 'delay')]
+        )
+        noise = Noise(self.information, self.weights, self.settings.gyro.cauchy)
+        _add_border(border, a, b, batch, noise, columns, self._work)
+
     def clock_scores(self, batch, a, b):
         scores = ClockScores.zeros(len(self.sensors), 1 + len(self.tolerances), self.grid.dim)
         _add_clocks(scores, a, b, batch, self._work)
@@ -158,6 +165,59 @@ def _add(normal, a, b, batch, noise, residuals, work):
         scatter(normal, index, total, noise.shares[imu] * noise.weight * robust)
         misfit, samples = 0.0, 0
     return cost, squared
+
+
+@kernel
+def _add_border(border, a, b, batch, noise, columns, work):
+    """Add what the samples say of axes and clock of their gyros, weighed as in `_add`."""
+    first, count = 0, batch.times.shape[0]
+    for m in range(count):
+        if m + 1 < count and batch.imus[m + 1] == batch.imus[m]:
+            continue
+        imu = batch.imus[m]
+        gp.relate(ends_in_time(a, b, batch.nodes[m]), work)
+        squared = 0.0
+        for k in range(first, m + 1):
+            gp.rate_at(work, batch.times[k])
+            for i in range(3):
+                squared += (work[0].v[3 + i] + a.bias[imu, i] - batch.omega[k, i]) ** 2
+        spread = noise.weight * squared / (3.0 * (m + 1 - first))
+        robust = 1.0 / (1.0 + spread / (noise.cauchy * noise.cauchy))
+        information = noise.shares[imu] * noise.weight * robust
+        for k in range(first, m + 1):
+            _add_sample(border, a, b, batch, k, information, columns[imu], work)
+        first = m + 1
+
+
+@kernel
+def _add_sample(border, a, b, batch, m, information, columns, work):
+    """Add one sample, whose node `relate` left in the workspace."""
+    n, imu, time = batch.nodes[m], batch.imus[m], batch.times[m]
+    slope, index, J, D = np.empty(3), np.empty(27, np.int64), np.zeros(27), np.zeros(11)
+    _rows_with_bias(a, n, imu, border.C.shape[0] // 2, index)
+    _acceleration(work, time, b.time - a.time, slope)
+    gp.evaluate(work, time, False, 3)
+    at = work[0]
+    for i in range(3):
+        error = at.v[3 + i] + a.bias[imu, i] - batch.omega[m, i]
+        J[12:15] = 0.0
+        J[12 + i] = 1.0
+        for j in range(12):
+            J[j], J[15 + j] = at.J_rate[3 + i, j], at.J_rate[3 + i, 12 + j]
+        D[:] = 0.0
+        for j in range(3):
+            D[3 * i + j] = -batch.omega[m, j]
+        D[9] = D[10] = slope[i]
+        for p in range(11):
+            if columns[p] < 0 or D[p] == 0.0:
+                continue
+            weighted = information * D[p]
+            border.g[columns[p]] += weighted * error
+            for q in range(11):
+                if columns[q] >= 0:
+                    border.H[columns[p], columns[q]] += weighted * D[q]
+            for j in range(27):
+                border.C[index[j], columns[p]] += weighted * J[j]
 
 
 @kernel

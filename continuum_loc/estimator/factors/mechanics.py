@@ -65,6 +65,7 @@ class MechanicsFactor(Factor):
         self._edges = np.concatenate([[0.0], np.cumsum(self._body.rod.spans)])
         self._heard: deque[tuple[int, np.ndarray]] = deque()
         self._used: int | None = None
+        self.motors: np.ndarray | None = None  # as they acted last, in the tendons' order
         self.information = self._information()
         self._room = np.zeros(1, TWIST), np.zeros(1, SCRATCH)
 
@@ -83,6 +84,7 @@ class MechanicsFactor(Factor):
         if not self._state.move(then):
             self._state = BodyState(self._body)
             raise MeasurementError('no equilibrium', f'no static shape for motors at {then}')
+        self.motors = then
         passed = self._options.period if self._used is None else abs(age)
         self._used = measurement.stamp
         share = min(passed / self._options.memory, 1.0)

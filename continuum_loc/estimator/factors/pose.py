@@ -13,6 +13,7 @@ from continuum_loc.compiling import kernel
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
 from continuum_loc.estimator.factors.base import Factor, FactorReport, known_sensor, require_finite
+from continuum_loc.estimator.interpolation import interpolated
 from continuum_loc.estimator.normal import gather, new_normal, scatter
 from continuum_loc.estimator.readings import travel_cause
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
@@ -70,6 +71,23 @@ class _PoseFactor(Factor):
         observed = np.diagonal(batch.information, axis1=1, axis2=2) > 0.0
         return FactorReport(cost, squared, int(np.sum(observed)), fits)
 
+    def bordered(self, batch, a, b, border, of):
+        found = interpolated(a, b, batch.times, batch.nodes, pose=True, rate=True)
+        error = lie.log(lie.inverse(batch.T_map_node) @ found.T)
+        right = lie.right_jacobian_inverse(error)
+        squared = np.einsum('mi,mij,mj->m', error, batch.information, error)
+        beyond = np.maximum(squared - self.plain, 0.0)
+        weight = self.weights[batch.sensors] / (1.0 + beyond / self.cauchy**2)
+        for m, (columns, by) in enumerate(self._constants(batch, found, error, of)):
+            rows = np.empty(24, np.int64)
+            rows_in_time(batch.nodes[m], self.grid.dim, rows)
+            W = weight[m] * batch.information[m]
+            border.add(rows, right[m] @ found.J_pose[m], columns, by, W, error[m])
+
+    def _constants(self, batch, found, error, of):
+        """Yield columns (p,) in theta of each pose's constants and its error's slope (6, p)."""
+        return iter(())
+
     def weigh(self, doubted, weight):
         # A pose says all of its node at once, and an encoder has no loss: 5 % would be too much.
         return super().weigh(doubted, LEAST_WEIGHT * weight)
@@ -85,6 +103,12 @@ class TrackerFactor(_PoseFactor):
         super().__init__(setup, [sensor.name for sensor in setup.robot.trackers])
         options = self.settings.tracker
         self.cauchy = options.cauchy
+        self.describe(setup.robot)
+        turn = np.radians(options.sigma_rotation_deg)
+        self._default = np.array([options.sigma_position] * 3 + [turn] * 3) ** -2.0
+
+    def describe(self, robot):
+        super().describe(robot)
         self._sensors = {
             sensor.name: (
                 number,
@@ -93,8 +117,6 @@ class TrackerFactor(_PoseFactor):
             )
             for number, sensor in enumerate(self.robot.trackers)
         }
-        turn = np.radians(options.sigma_rotation_deg)
-        self._default = np.array([options.sigma_position] * 3 + [turn] * 3) ** -2.0
 
     def row(self, measurement: TrackedPose) -> Row:
         number, node, T_sensor_ring = known_sensor(self._sensors, measurement.sensor, 'tracker')
@@ -111,6 +133,16 @@ class TrackerFactor(_PoseFactor):
                     f"covariance of '{measurement.sensor}' is not positive definite",
                 ) from None
         return Row(number, node, measurement.T_map_sensor @ T_sensor_ring, information)
+
+    def _constants(self, batch, found, error, of):
+        columns = np.hstack([of.columns(kind, self.sensors) for kind in ('mount', 'clock')])
+        mounts = [lie.adjoint(sensor.mount.T_ring_sensor) for sensor in self.robot.trackers]
+        left, right = lie.left_jacobian_inverse(error), lie.right_jacobian_inverse(error)
+        by_mount = left @ np.array(mounts)[batch.sensors]
+        by_clock = right @ found.v[:, :, None]
+        yield from zip(
+            columns[batch.sensors], np.concatenate([by_mount, by_clock], axis=2), strict=True
+        )
 
 
 def travel_of(measurement: EncoderSample, insertion: Insertion) -> float:
@@ -140,6 +172,10 @@ class InsertionFactor(_PoseFactor):
 
     def __init__(self, setup):
         super().__init__(setup, ['insertion'])
+        if self.settings.calibration.enabled:
+            # A base that is a little off as built is no reason to let its encoder go.
+            built = setup.robot.tolerances.base_position / setup.robot.base.insertion.sigma
+            self.plain = self.plain * (1.0 + built**2)
 
     def row(self, measurement: EncoderSample) -> Row:
         base = self.robot.base
@@ -151,6 +187,12 @@ class InsertionFactor(_PoseFactor):
         if base.mode == 'fixed':  # what a free one travels from is known at the start alone
             information[0, 0] = insertion.sigma**-2.0
         return Row(0, 0, T_map_base, information)
+
+    def _constants(self, batch, found, error, of):
+        columns = of.columns('base', [''])[0]
+        back = lie.adjoint(lie.inverse(batch.T_map_node) @ self.robot.base.T_map_base)
+        for by in -lie.left_jacobian_inverse(error) @ back:
+            yield columns, by
 
     @classmethod
     def wanted(cls, setup):

@@ -124,6 +124,11 @@ class StrainFactor(Factor):
         cost, squared = _add(normal, a, b, self.grid.s, batch, loss, self._work)
         return FactorReport(cost, squared, 2 * len(batch.times))
 
+    def bordered(self, batch, a, b, border, of):
+        columns = np.hstack([of.columns(kind, ['strain']) for kind in ('strain', 'clock')])[0]
+        loss = Loss(self.settings.strain.cauchy, self.weights[0])
+        _add_border(border, a, b, self.grid.s, batch, loss, columns, self._work)
+
     def awaited(self):
         return self.robot.strain is not None
 
@@ -158,6 +163,56 @@ def _add(normal, a, b, s, batch, loss, work):
             index[24 + i] = dim + index[i]
         scatter(normal, index, total, loss.weight)
     return loss.weight * cost, squared
+
+
+@kernel
+def _add_border(border, a, b, s, batch, loss, columns, work):
+    """Add what the readings say of scale, twist, offsets and clock of the sensor."""
+    count, dim, dt = batch.segments.shape[0], border.C.shape[0] // 2, b.time - a.time
+    stations = Stations(
+        np.empty((count, 4)), np.zeros((count, 4, 48)), np.empty((0, 4, 4)), np.empty((0, 4))
+    )
+    _predict(a, s, batch, stations, 0, work)
+    _predict(b, s, batch, stations, 1, work)
+    coupled, D, WD = np.zeros((count, 4, 5)), np.zeros((2, 5)), np.zeros((2, 5))
+    e, c2 = np.empty(2), loss.cauchy * loss.cauchy
+    for r in range(batch.times.shape[0]):
+        m, u = batch.station[r], batch.times[r] / dt
+        value, information = stations.values[m], batch.information[r]
+        for i in range(2):
+            e[i] = (1.0 - u) * value[i] + u * value[2 + i] - batch.bending[r, i]
+            D[i, 0], D[i, 2 + i] = batch.bending[r, i], 1.0
+            D[i, 4] = (value[2 + i] - value[i]) / dt
+        D[0, 1], D[1, 1] = -batch.bending[r, 1], batch.bending[r, 0]
+        u2 = 0.0
+        for i in range(2):
+            for j in range(2):
+                u2 += e[i] * information[i, j] * e[j]
+        weight = loss.weight / (1.0 + u2 / c2)
+        for i in range(2):
+            for p in range(5):
+                WD[i, p] = weight * (information[i, 0] * D[0, p] + information[i, 1] * D[1, p])
+                coupled[m, i, p] += (1.0 - u) * WD[i, p]
+                coupled[m, 2 + i, p] += u * WD[i, p]
+        for p in range(5):
+            if columns[p] < 0:
+                continue
+            for i in range(2):
+                border.g[columns[p]] += WD[i, p] * e[i]
+                for q in range(5):
+                    if columns[q] >= 0:
+                        border.H[columns[p], columns[q]] += D[i, p] * WD[i, q]
+    index = np.empty(48, np.int64)
+    for m in range(count):
+        rows_along(batch.segments[m], STRAIN, index)
+        for i in range(24):
+            index[24 + i] = dim + index[i]
+        for p in range(5):
+            if columns[p] < 0:
+                continue
+            for i in range(4):
+                for j in range(48):
+                    border.C[index[j], columns[p]] += stations.J[m, i, j] * coupled[m, i, p]
 
 
 @kernel

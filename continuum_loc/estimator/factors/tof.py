@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from continuum_loc.compiling import kernel
+from continuum_loc.corrections import measured_share
 from continuum_loc.errors import MeasurementError
 from continuum_loc.estimator import gp
+from continuum_loc.estimator.border import add_local
 from continuum_loc.estimator.factors.base import (
     ClockScores,
     Factor,
@@ -20,8 +22,17 @@ from continuum_loc.estimator.factors.base import (
     known_sensor,
     Repeats,
 )
-from continuum_loc.estimator.matching import Frame, frame_of, match, Rules, unmatched, weigh
+from continuum_loc.estimator.matching import (
+    Frame,
+    frame_of,
+    match,
+    Rules,
+    unmatched,
+    weigh,
+    weigh_ranges,
+)
 from continuum_loc.estimator.normal import gather, new_normal, scatter
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.state import ends_in_time, rows_in_time
 from continuum_loc.estimator.tolerance import MOUNT
 from continuum_loc.measurements import TOF_HALF_CONFIDENT, TOF_VALID, TofFrame
@@ -70,6 +81,27 @@ class Optics(NamedTuple):
     coefficient: np.ndarray
 
 
+class Optical(NamedTuple):
+    """
+    What the constants of S sensors are measured by.
+
+    columns: (S, 16) places of mount, range, clock, delay and map; T_ring_sensor: (S, 4, 4);
+    along: (Z,) one over the share of a zone's range that is measured; T_map_middle: (4, 4).
+    """
+
+    columns: np.ndarray
+    T_ring_sensor: np.ndarray
+    along: np.ndarray
+    T_map_middle: np.ndarray
+
+
+class Unit(NamedTuple):
+    """Where a sensor is in its node's frame (3,), and `Optical.along`."""
+
+    origin: np.ndarray
+    along: np.ndarray
+
+
 class TofFactor(Factor):
     """Zones of a ToF frame against the map's surface."""
 
@@ -83,14 +115,8 @@ class TofFactor(Factor):
         self.rate = setup.robot.tof_model.rate
         self.surface = setup.surface
         self._repeats = Repeats(MOST_REPEATS)
-        self._sensors = {
-            sensor.name: (
-                number,
-                self.grid.node_at(self.robot.sensor_arclength(sensor.name)),
-                sensor.mount.T_ring_sensor,
-            )
-            for number, sensor in enumerate(self.robot.tof)
-        }
+        self._optical: tuple[Parameters, Optical] | None = None
+        self.describe(setup.robot)
         model, options = self.robot.tof_model, self.settings.tof
         self._optics = Optics(
             model.min_range,
@@ -113,9 +139,25 @@ class TofFactor(Factor):
     def wanted(cls, setup):
         return super().wanted(setup) and setup.prior_map is not None and bool(setup.robot.tof)
 
+    def describe(self, robot):
+        super().describe(robot)
+        self._sensors = {
+            sensor.name: (
+                number,
+                self.grid.node_at(self.robot.sensor_arclength(sensor.name)),
+                sensor.mount.T_ring_sensor,
+            )
+            for number, sensor in enumerate(self.robot.tof)
+        }
+
     @property
     def tight(self):
         return self.rules.gate <= self._tracking.gate
+
+    def use_map(self, setup, rows):
+        self.surface = setup.surface
+        for row in rows:
+            row.hits[:], row.places[:] = unmatched(len(row.hits))
 
     def loosen(self, iteration):
         """
@@ -167,11 +209,54 @@ class TofFactor(Factor):
         sums = _add(normal, a, b, batch, sensors, self.surface, self.rules, self._work)
         return FactorReport(*sums, fits=sensors.tally[:, :2], flicker=sensors.tally[:, 2:])
 
+    def bordered(self, batch, a, b, border, of):
+        if self._optical is None or self._optical[0] is not of:
+            self._optical = of, self._optical_of(of)
+        optical = self._optical[1]
+        planes, rules = self.surface.planes, self.rules
+        _add_border(border, a, b, batch, self.weights, planes, rules, optical, self._work)
+
+    def _optical_of(self, of):
+        kinds = [of.columns(kind, self.sensors) for kind in ('mount', 'range', 'clock', 'delay')]
+        columns = np.hstack([*kinds, np.tile(of.columns('map', ['']), (len(self.sensors), 1))])
+        T_map_middle = np.eye(4)
+        T_map_middle[:3, 3] = of.middle
+        mounts = np.array([sensor.mount.T_ring_sensor for sensor in self.robot.tof])
+        return Optical(columns, mounts, 1.0 / measured_share(self.robot.tof_model), T_map_middle)
+
     def clock_scores(self, batch, a, b):
         scores = ClockScores.zeros(len(self.sensors), 1 + len(MOUNT), self.grid.dim)
         planes = self.surface.planes
         _add_clocks(scores, a, b, batch, self.weights, planes, self.rules, self._work)
         return scores._replace(spread=np.ones(len(self.sensors)))  # the loss took care of outliers
+
+
+@kernel
+def _add_border(border, a, b, batch, weights, planes, rules, optical, work):
+    """Add what each frame says of mount, range and clock of its sensor, and of the map."""
+    local, M = new_normal(8), np.zeros((8, 16))
+    back, Ad = np.empty((4, 4)), np.empty((6, 6))
+    index, related = np.empty(24, np.int64), -1
+    M[6, 6] = M[7, 7] = 1.0
+    for f in range(batch.times.shape[0]):
+        n, s, frame = batch.nodes[f], batch.sensors[f], frame_of(batch.frames, f)
+        if n != related:  # frames of a node come after one another
+            gp.relate(ends_in_time(a, b, n), work)
+            rows_in_time(n, border.C.shape[0] // 2, index)
+            related = n
+        gp.evaluate(work, batch.times[f], True, 6)
+        at = work[0]
+        unit = Unit(optical.T_ring_sensor[s, :3, 3], optical.along)
+        weigh_ranges(at.T, frame, weights[s], planes, rules, unit, local)
+        lie_kernels.adjoint(optical.T_ring_sensor[s], Ad)
+        M[:6, :6] = Ad
+        M[:6, 8] = M[:6, 9] = at.v
+        lie_kernels.relative(at.T, optical.T_map_middle, back)
+        lie_kernels.adjoint(back, Ad)
+        for i in range(6):
+            for j in range(6):
+                M[i, 10 + j] = -Ad[i, j]
+        add_local(border, index, at.J_pose, optical.columns[s], M, local)
 
 
 @kernel

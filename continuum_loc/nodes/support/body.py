@@ -21,7 +21,7 @@ from msg_tools.topics import RING_POSE, RING_TWIST
 import numpy as np
 
 BASE = 'base'  # what is put for a ring's name where the base is meant
-SPHERE, LINE_STRIP, LINE_LIST, TEXT, DELETE_ALL = 2, 4, 5, 9, 3  # of Marker
+ARROW, SPHERE, LINE_STRIP, LINE_LIST, TEXT, DELETE_ALL = 0, 2, 4, 5, 9, 3  # of Marker
 COLOURS = {
     'tracking': (0.20, 0.70, 0.95, 1.0),
     'doubtful': (1.0, 0.65, 0.10, 1.0),
@@ -31,6 +31,7 @@ COLOURS = {
 RED, SIGHT, SIGMA = (0.95, 0.10, 0.10, 1.0), (0.35, 0.85, 0.45, 0.6), (0.95, 0.85, 0.25, 0.35)
 SIGHT_LENGTH = 0.1  # m; of the pyramids that show what a ToF sensor looks at
 LINE, LETTERS = 0.0015, 0.02  # m
+METRES_PER_NEWTON = 0.05  # of the arrows that show forces
 SHOWN_SIGMAS = 3.0
 
 
@@ -84,6 +85,7 @@ def body_message(make: Messages, frames: Frames, estimate: Estimate) -> Any:
         *_ellipsoids(make, header, estimate),
         *_sights(make, header, frames.robot, estimate),
         *_labels(make, header, frames.robot, estimate),
+        *_loads(make, header, estimate),
     ]
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
 
@@ -177,6 +179,22 @@ def _labels(
             scale=_vector(make, (0.0, 0.0, LETTERS)),
             color=_colour(make, RED),
             text=text,
+        )
+
+
+def _loads(make: Messages, header: Any, estimate: Estimate) -> Iterator[Any]:
+    """Draw an arrow that ends where something pushes, METRES_PER_NEWTON long."""
+    for number, load in enumerate(estimate.loads):
+        ends = np.stack([load.place - METRES_PER_NEWTON * load.force, load.place])
+        yield _marker(
+            make,
+            header,
+            'load',
+            number,
+            type=ARROW,
+            scale=_vector(make, (3.0 * LINE, 8.0 * LINE, 0.0)),
+            color=_colour(make, RED),
+            points=_points(make, ends),
         )
 
 

@@ -76,6 +76,17 @@ class FrameTree:
             )
         return lie.inverse(down[common]) @ up[common]
 
+    def latest(self, target: str, source: str) -> int | None:
+        """Newest stamp [ns] at which `source` is known in `target`; None where it never moved."""
+        with self._lock:
+            stamps = [
+                self._moving[frame][-1][0]
+                for end in (source, target)
+                for frame, _ in self._ascent(end, None)
+                if frame in self._parents and frame not in self._fixed
+            ]
+        return min(stamps, default=None)
+
     def _ascent(self, frame: str, stamp: int | None) -> Iterator[tuple[str, np.ndarray]]:
         """(ancestor, (4, 4) of the frame in it), beginning with the frame itself."""
         T = np.eye(4)

@@ -14,7 +14,7 @@ import difflib
 import sys
 from typing import Any, get_args, get_origin, Literal, TypeVar
 
-from continuum_loc.errors import SettingsError
+from continuum_loc.errors import InputError, SettingsError
 from continuum_loc.settings import parse_settings, Settings
 from continuum_loc.yaml_files import check_parameter_file, is_octal, OCTAL
 from pydantic.fields import FieldInfo
@@ -124,7 +124,7 @@ def guard(node: Node, apply: Callable[[dict[str, Any]], str | None]) -> None:
         }
         try:
             reason = apply(values) if values else None
-        except SettingsError as error:
+        except InputError as error:
             reason = str(error)
         return SetParametersResult(successful=reason is None, reason=reason or '')
 

@@ -26,7 +26,7 @@ class EstimatorNodeSettings(NodeSettings):
     """Node `estimator`."""
 
     robot: str = Field('engine', description='robot description: a bundled name or a YAML file')
-    map: str = Field(  # noqa: A003  (a parameter's public name)
+    map: str = live(  # noqa: A003  (a parameter's public name)
         '', description='prior map: npz, a cloud or a mesh (see docs/files.md); empty for none'
     )
     settings: str = Field(
@@ -50,6 +50,11 @@ class EstimatorNodeSettings(NodeSettings):
         'odom', min_length=1, description='name of the frame in which others move the base'
     )
     base_frame: str = Field('base_link', min_length=1, description="name of the base's frame")
+    base_tf: str = Field(
+        '',
+        description='frame on /tf that carries the base: where it is in the `frame` of the robot '
+        "description's base.measurement goes out on `base/pose`, and is heard there; empty: none",
+    )
     map_points: int = Field(
         100_000, ge=0, description='most points of the published `prior_map`; 0 for all'
     )

@@ -1,0 +1,1 @@
+"""Calibration: what a robot's recordings say of the robot itself."""
