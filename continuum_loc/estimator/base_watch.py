@@ -30,16 +30,12 @@ class BaseWatch:
         base = setup.robot.base
         self._base, self._window, self._grid = base, window, setup.grid
         sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
-<<<<<<< HEAD
         self._variance = np.square(sigma) + np.square(BASE)
-=======
-        self._variance = np.square(sigma)
         if setup.settings.calibration.enabled and base.mode == 'fixed':
             told = setup.robot.tolerances
             turn = np.radians(told.base_rotation_deg)
             self._variance += np.square(np.repeat([told.base_position, turn], 3))
         self.spread: Callable[[np.ndarray], np.ndarray] | None = None
->>>>>>> main
         self._stays = base.measurement.frame == 'map' and base.measurement.drift == 0.0
         self._travel: tuple[float, float] | None = None  # [s], [m]
         self._since: dict[str, float] = {}

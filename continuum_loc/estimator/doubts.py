@@ -126,15 +126,10 @@ class Doubts:
         if not self._settings.enabled or time < ENOUGH:
             return
         self._forget(time, epoch)
-<<<<<<< HEAD
         # Where the rest does not fit either, base and encoder are no better witnesses.
         off = self._does_not_fit()
-        for name, cause in self._base.causes(time).items():
-            self._tell((name,), '' if off else cause, time)
-=======
         for name, cause in self.base.causes(time).items():
-            self._tell((name,), cause, time)
->>>>>>> main
+            self._tell((name,), '' if off else cause, time)
         if time >= self._next_reading:
             self._next_reading = time + self._settings.period
             self._read(time)

@@ -103,20 +103,15 @@ class Health:
             cause = self._sights[name][1].cause if name in self._sights else ''
             known = name in self.disbelieved or bool(cause)
             if known or not waiting and (body_believed or name not in self._tof_names):
-<<<<<<< HEAD
                 reasons[name] = cause or MISFIT
         fits = alone and MISFIT not in reasons.values() and self._most_fit()
-        if fits and not (body_doubted or self.waiting):
-=======
-                reasons[name] = MISFIT
         if self.corrected is not None:
             reasons |= {
                 name: _late(offset)
                 for name, offset in self.corrected.items()
                 if name not in reasons
             }
-        elif not (body_doubted or self.waiting or MISFIT in reasons.values()):
->>>>>>> main
+        elif fits and not (body_doubted or self.waiting):
             self._look_at_clocks(time)
         elif time - self._clocks_known > KNOWN_FOR:
             self._late = {}
