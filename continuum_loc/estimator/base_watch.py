@@ -30,8 +30,10 @@ class BaseWatch:
         base = setup.robot.base
         self._base, self._window, self._grid = base, window, setup.grid
         sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
-        self._variance = np.square(sigma) + np.square(BASE)
-        if setup.settings.calibration.enabled and base.mode == 'fixed':
+        self._variance = np.square(sigma)
+        if base.mode == 'fixed' and not setup.settings.calibration.enabled:
+            self._variance += np.square(BASE)
+        elif base.mode == 'fixed':
             told = setup.robot.tolerances
             turn = np.radians(told.base_rotation_deg)
             self._variance += np.square(np.repeat([told.base_position, turn], 3))

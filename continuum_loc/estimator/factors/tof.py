@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from continuum_loc import lie_kernels
 from continuum_loc.compiling import kernel
 from continuum_loc.corrections import measured_share
 from continuum_loc.errors import MeasurementError
