@@ -225,7 +225,8 @@ class Unknowns:
             for number in range(count):
                 own = slice(first[sensor + number], first[sensor + number] + size)
                 h[own, own] = blocks[number]
-            spread[sensor : sensor + count] = np.mean([one.spread for _, one in told], axis=0)
+            members = slice(sensor, sensor + count)
+            spread[members] = np.mean([one.spread for _, one in told], axis=0)
             sensor += count
         prior = [np.r_[0.0, f.tolerances**-2.0] for f in parts for _ in f.sensors]
         return cls(names, first, g, h, C, np.concatenate(prior or [np.empty(0)]), spread)
