@@ -71,10 +71,21 @@ class Calibrator:
         return border
 
     def due(self, time: float) -> np.ndarray | None:
-        """Say by how much (P,) to change what measurements are taken for at `time` [s]."""
+        """
+        Say by how much (P,) to change what measurements are taken for at `time` [s].
+
+        Where the equations are singular, nothing is said.
+        """
         chain = self._window.chain
         if chain.border is None or time < self._next:
             return None
+        try:
+            return self._look(time)
+        except np.linalg.LinAlgError:
+            return None
+
+    def _look(self, time: float) -> np.ndarray | None:
+        chain = self._window.chain
         self._next = time + self._settings.period
         share = self._settings.period / self._settings.drift
         self._wander(np.arange(len(self.theta)), share * self.parameters.sigma**2)
@@ -84,8 +95,10 @@ class Calibrator:
         self._sensitivity = W
         if not self._settings.online:
             return None
-        self._known = H, g
-        self.covariance = np.linalg.inv(H)
+        covariance = np.linalg.inv(H)
+        if np.min(np.diag(covariance)) <= 0.0:
+            return None
+        self._known, self.covariance = (H, g), covariance
         step = self.parameters.centred(self.theta, -self.covariance @ g)
         notable = np.abs(step) > NOTABLE * np.sqrt(np.diag(self.covariance))
         return step if notable.any() else None

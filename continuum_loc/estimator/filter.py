@@ -141,7 +141,7 @@ class SlidingWindowFilter:
         """
         self.counts['received'][type(measurement).__name__] += 1
         if self._calibrator is not None:
-            self._raw.append(measurement)
+            self._calibrate(measurement)
         measurement = self._corrections.applied(measurement)
         estimate = self._step() if self._cycle.over(measurement) else None
         if self._admit(measurement) and self._cycle.complete(measurement):
@@ -260,9 +260,7 @@ class SlidingWindowFilter:
             self.start.watch(time, self.recovery.worst_share())
             if told and self.start.pending:
                 self.recovery.lose()  # this last estimate says so
-            estimate = self._estimate(time, outcome, started) if told else None
-            self._calibrate(time)
-            return estimate
+            return self._estimate(time, outcome, started) if told else None
 
     def _locate(self, time: float) -> None:
         """Look for the base, and tell nothing."""
@@ -307,16 +305,22 @@ class SlidingWindowFilter:
             return None
         return Calibrator(parameters, self.window, self.settings.calibration)
 
-    def _calibrate(self, time: float) -> None:
-        """Read the window anew where the robot turned out to be another than it was taken for."""
-        if self._calibrator is None:
+    def _calibrate(self, measurement: Measurement) -> None:
+        """
+        Keep a measurement as it came, and find out whether the robot is what it is taken for.
+
+        It is done between a step and the next measurement, so that no estimate waits for it.
+        """
+        self._raw.append(measurement)
+        if self.epoch is None or not self.window.intervals:
             return
-        step = self._calibrator.due(time)
         oldest = self.window.columns[0].time - TIME_EPSILON
-        while self._raw and seconds(self._raw[0].stamp, self.epoch) < oldest - MOST_CLOCK:
+        while seconds(self._raw[0].stamp, self.epoch) < oldest - MOST_CLOCK and len(self._raw) > 1:
             self._raw.popleft()
+        step = self._calibrator.due(seconds(self.newest, self.epoch))
         if step is None:
             return
+        self._raw.pop()  # it is about to enter
         watch = self.settings.health
         self._describe(self._calibrator.take(step).robot)
         self.health.corrected = self._calibrator.late(watch.clock_offset, watch.clock_sigmas)
@@ -324,11 +328,12 @@ class SlidingWindowFilter:
             factor.describe(self.setup.robot)
         for interval in self.window.intervals:
             interval.clear()
-        for measurement in self._raw:
-            measurement = self._corrections.applied(measurement)
-            at = seconds(measurement.stamp, self.epoch)
+        for one in self._raw:
+            one = self._corrections.applied(one)
+            at = seconds(one.stamp, self.epoch)
             if oldest <= at <= self.window.columns[-1].time + TIME_EPSILON:
-                self._enter_again(at, measurement)
+                self._enter_again(at, one)
+        self._raw.append(measurement)
 
     def _enter_again(self, time: float, measurement: Measurement) -> None:
         """Put a measurement that was counted before into its interval."""
