@@ -20,7 +20,7 @@ from continuum_loc.estimator.fit import consistency, fit_of, misfit_by_factor, s
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.readings import curvature_cause, range_cause, travel_cause
 from continuum_loc.estimator.settings import DoubtSettings
-from continuum_loc.estimator.turning import CONTRADICTS, TurnWatch
+from continuum_loc.estimator.turning import TurnWatch
 from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import (
     BaseSample,
@@ -152,8 +152,7 @@ class Doubts:
             causes = one.look(self._window)
             if causes is not None:
                 for name, cause in causes.items():
-                    if cause != CONTRADICTS or not set(self.causes) - {name}:
-                        self._tell((name,), cause, time)
+                    self._tell((name,), cause, time)
                 self._comparisons.rotate(-1 - self._comparisons.index(one))
                 return
 

@@ -23,12 +23,10 @@ from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.readings import GYRO_CAUSES
 import numpy as np
 
-CONTRADICTS = 'contradicts the rest'
 OFF_SCALE = 0.04  # of each entry of a healthy gyro's scale and axes: 2 % and 2 degrees
 MEMORY = 20.0  # [s] in which what was heard counts half
 CERTAIN = 8.0  # nats that a cause has to be likelier by than the description
 PER_CHANGE = 1.0  # nats that each exchanged axis or sign makes a cause less likely beforehand
-ANYTHING = 20.0  # nats that any matrix at all is less likely by: the body may be wrong itself
 FITS = 4.0  # mean squared residual up to which a cause explains an interval
 TURNING = 16.0  # squared turn over its variance
 LEAST_SHARE = 0.7  # of an interval's samples
@@ -55,8 +53,7 @@ class Ledger:
     """
 
     def __init__(self, bias_sigma: float, sample_sigma: float):
-        bias = np.full((len(CAUSES), 3), bias_sigma)
-        self._prior = np.hstack([bias, np.repeat(OFF_SCALES[:, None], 9, axis=1)]) ** -2.0
+        self._prior = np.r_[np.full(3, bias_sigma), np.full(9, OFF_SCALE)] ** -2.0
         self._variance = sample_sigma**2
         self.clear()
 
@@ -80,11 +77,9 @@ class Ledger:
         S = spreads @ turn.covariance @ spreads.transpose(0, 2, 1)
         S += self._variance / samples * GAINS[:, None, None] ** 2 * np.eye(3)
         J = G @ np.hstack([np.eye(3), np.kron(np.eye(3), turn.rate)])
-        if not turn.sure:
-            J[-1, :, 3:] = 0.0
         error = mean - G @ turn.rate
         W = np.linalg.inv(S)
-        expected = S + (J / self._prior[:, None]) @ J.transpose(0, 2, 1)
+        expected = S + (J / self._prior) @ J.transpose(0, 2, 1)
         surprise = np.einsum('hi,hij,hj->h', error, np.linalg.inv(expected), error) / 3.0
         if surprise.min() > FITS:
             return
@@ -96,11 +91,11 @@ class Ledger:
 
     def likelihoods(self) -> np.ndarray:
         """Log likelihood of each cause with the unknowns marginalised, and what it is worth."""
-        posterior = self._information + self._prior[:, None] * np.eye(12)
+        posterior = self._information + np.diag(self._prior)
         explained = np.einsum(
             'hi,hi->h', self._vector, np.linalg.solve(posterior, self._vector[..., None])[..., 0]
         )
-        volume = np.linalg.slogdet(posterior)[1] - np.log(self._prior).sum(axis=1)
+        volume = np.linalg.slogdet(posterior)[1] - np.log(self._prior).sum()
         return 0.5 * (explained - self._squares - volume) - BEFOREHAND
 
     def cause(self) -> str:
@@ -139,13 +134,11 @@ class TurnWatch(Comparison):
         return {name: ledger.cause() for name, ledger in self._ledgers.items()}
 
 
-# The last is any matrix at all.
-CAUSES = ['', *(cause for cause, _, _ in GYRO_CAUSES), CONTRADICTS]
+CAUSES = ['', *(cause for cause, _, _ in GYRO_CAUSES)]
 # What a gyro reads of a turn: the inverse of what makes the turn of its readings.
-MATRICES = np.array([np.eye(3), *(np.linalg.inv(M) for _, M, _ in GYRO_CAUSES), np.eye(3)])
-BEFOREHAND = np.array([0.0, *(PER_CHANGE * n for _, _, n in GYRO_CAUSES), ANYTHING])
+MATRICES = np.array([np.eye(3), *(np.linalg.inv(M) for _, M, _ in GYRO_CAUSES)])
+BEFOREHAND = np.array([0.0, *(PER_CHANGE * n for _, _, n in GYRO_CAUSES)])
 SLOW = 2  # reads next to nothing of any turn
 # A gyro quieter than the body is known is none in another unit: no cause narrows its error.
 GAINS = np.maximum(np.abs(MATRICES).max(axis=(1, 2)), 1.0)
 SPREADS = MATRICES * (GAINS / np.abs(MATRICES).max(axis=(1, 2)))[:, None, None]
-OFF_SCALES = np.array([*(OFF_SCALE for _ in MATRICES[1:]), 1.0])
