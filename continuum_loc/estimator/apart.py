@@ -21,6 +21,8 @@ from continuum_loc.estimator.state import Column, NODE_DIM
 from continuum_loc.estimator.window import Window
 import numpy as np
 
+EARLY = 5.0  # [s] of data in which what is wrong has to be found soon
+LATER = 3  # intervals that one solve serves from then on
 FOUND = 0.5  # [s] of data in which the body still finds its place, and seems to move
 ROTATION = np.arange(3, 6)  # of a node's state
 
@@ -75,6 +77,8 @@ class Apart:
 class Comparison(ABC):
     """Hears every interval once, as soon as another follows it, with a body without `factor`."""
 
+    at_once: int = 1  # intervals that one solve serves at first
+
     def __init__(self, factor: Factor):
         self.factor = factor
         self._heard_to = -np.inf
@@ -84,7 +88,11 @@ class Comparison(ABC):
         last = settled(window) - 1
         first = max(self._heard_to, FOUND)
         due = [k for k in range(1, last) if window.intervals[k].start > first]
-        body = Apart.of(window, self.factor) if due else None
+        # At first each at once, later several for one solve.
+        early = window.columns[-1].time < EARLY
+        if len(due) < min(self.at_once if early else LATER, max(last - 1, 1)):
+            return None
+        body = Apart.of(window, self.factor)
         if body is None:
             return None
         others = ('gyro', self.factor.name)

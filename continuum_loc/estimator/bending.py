@@ -29,6 +29,8 @@ BENDING = (4, 5)  # of a node's strain
 class BendWatch(Comparison):
     """Compares a strain sensor with the bending of the body."""
 
+    at_once = 2  # it tells by the shape, which stays longer than a motion
+
     def __init__(self, setup: Setup, strain: Factor):
         super().__init__(strain)
         self._grid = setup.grid
