@@ -1,5 +1,5 @@
 # make demo | test | test-noble | test-noble-quick | test-launch | docs | lint | bench | bench-check | profile | install | clean. Everything runs in .venv, which `install` makes.
-.PHONY: install demo test test-noble test-noble-quick test-launch docs lint bench bench-check profile clean
+.PHONY: install demo test test-noble test-noble-quick noble-python test-launch docs lint bench bench-check profile clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do \
@@ -34,10 +34,14 @@ test: install
 
 # The oldest versions that are allowed, which are those of Ubuntu 24.04, and its Python where there is one.
 NOBLE := .venv-noble
-NOBLE_PYTHON ?= $(shell for p in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python3.12 $(PYTHON); do \
+NOBLE_PYTHON ?= $(shell for p in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python3.12; do \
 	$$p -c '' 2>/dev/null && echo $$p && break; done)
 NOBLE_QUICK := test_lie test_gp test_chain test_factors test_window test_filter_claims test_mechanics \
 	test_bag test_cli test_node_parameters test_node_estimator
+
+# Prints which Python 3.12 `test-noble` takes; nothing where there is none.
+noble-python:
+	@echo $(NOBLE_PYTHON)
 
 test-noble: $(NOBLE)/installed
 	PYTHONPATH=$(CURDIR) $(NOBLE)/bin/python -m pytest test
@@ -46,6 +50,8 @@ test-noble-quick: $(NOBLE)/installed
 	PYTHONPATH=$(CURDIR) $(NOBLE)/bin/python -m pytest $(NOBLE_QUICK:%=test/%.py)
 
 $(NOBLE)/installed: requirements-noble.txt
+	@test -n "$(NOBLE_PYTHON)" || { echo "Python 3.12 is needed, which is what Ubuntu 24.04 has, and none is on PATH." \
+		"Install it, or name it: make $(MAKECMDGOALS) NOBLE_PYTHON=/path/to/python3.12"; exit 1; }
 	@.ci/system-libraries
 	$(NOBLE_PYTHON) -m venv --clear $(NOBLE)
 	$(NOBLE)/bin/python -m pip install --quiet --no-deps -r requirements-noble.txt
