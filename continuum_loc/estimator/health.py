@@ -23,6 +23,7 @@ import numpy as np
 HEALTHY_SHARE = 0.85  # of the median sensor's samples fit, else the body is in doubt, not a sensor
 RECENT = 2  # intervals that say whether a ToF sensor fits now
 VOTES = 2.7  # squared deviations over those asked for, of tests in a row
+MOST_VOTES = 2.0  # of one test, however certain
 MOST_SPREAD = 20.0  # of the residuals' variance over the noise's
 SEEN_FOR = 1.0  # [s] that what a ToF sensor was found to see holds
 MOST_BLIND = 0.5  # of the ToF sensors may be wrong, else the body is
@@ -210,7 +211,7 @@ class Health:
         self, evidence: ClockEvidence, known: dict[tuple[str, ...], ClockOffset]
     ) -> dict[tuple[str, ...], ClockOffset]:
         """
-        Find more clocks that are off: very certainly, or in several tests in a row.
+        Find more clocks that are off, in two tests in a row at least.
 
         What the knots miss of a motion looks like a clock for as long as that motion is in sight.
         """
@@ -218,7 +219,8 @@ class Health:
         others = [group for group in self._clock_groups if not struck & set(group)]
         found = evidence.offsets(others, options.clock_offset, options.clock_sigmas)
         self._votes = {
-            one.group: self._votes.get(one.group, 0.0) + (one.sigmas / options.clock_sigmas) ** 2
+            one.group: self._votes.get(one.group, 0.0)
+            + min((one.sigmas / options.clock_sigmas) ** 2, MOST_VOTES)
             for one in found
         }
         return {one.sensors: one for one in found if self._votes[one.group] >= VOTES}
