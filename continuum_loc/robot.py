@@ -80,6 +80,11 @@ def mounted(T_ring_sensor: np.ndarray) -> Mount:
     return Mount(xyz=tuple(T_ring_sensor[:3, 3].tolist()), rpy_deg=_rpy_deg(T_ring_sensor))
 
 
+def _six(position: float, rotation_deg: float) -> np.ndarray:
+    """(6,) standard deviations of a pose [m, rad], of one of each axis [m, deg]."""
+    return np.repeat([position, np.radians(rotation_deg)], 3)
+
+
 def _rpy_deg(T: np.ndarray) -> Vector3:
     rpy_deg = Rotation.from_matrix(T[:3, :3]).as_euler('xyz', degrees=True)
     return tuple(rpy_deg.tolist())
@@ -233,6 +238,11 @@ class Base(Settings):
         if min(value) <= 0.0:
             raise ValueError('both must be greater than 0')
         return value
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(6,) of its pose [m, rad]."""
+        return _six(self.sigma_position, self.sigma_rotation_deg)
 
     @cached_property
     def T_map_base(self) -> np.ndarray:
@@ -393,6 +403,16 @@ class Tolerances(Settings):
     map_position: float = Field(0.0, ge=0.0, description='of the map, per axis [m]')
     map_rotation_deg: float = Field(0.0, ge=0.0, description='of the map, per axis [deg]')
     length: float = Field(0.003, ge=0.0, description='of the backbone, relative')
+
+    @property
+    def mount_sigma(self) -> np.ndarray:
+        """(6,) of a sensor's mount [m, rad]."""
+        return _six(self.mount_position, self.mount_rotation_deg)
+
+    @property
+    def base_sigma(self) -> np.ndarray:
+        """(6,) of the base as built [m, rad]."""
+        return _six(self.base_position, self.base_rotation_deg)
 
 
 class HallModel(Settings):

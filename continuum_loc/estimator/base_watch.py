@@ -29,14 +29,10 @@ class BaseWatch:
     def __init__(self, setup: Setup, window: Window):
         base = setup.robot.base
         self._base, self._window, self._grid = base, window, setup.grid
-        sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
-        self._variance = np.square(sigma)
-        if base.mode == 'fixed' and not setup.settings.calibration.enabled:
-            self._variance += np.square(BASE)
-        elif base.mode == 'fixed':
-            told = setup.robot.tolerances
-            turn = np.radians(told.base_rotation_deg)
-            self._variance += np.square(np.repeat([told.base_position, turn], 3))
+        self._variance = np.square(base.sigma)
+        if base.mode == 'fixed':
+            estimated = setup.settings.calibration.enabled
+            self._variance += np.square(setup.robot.tolerances.base_sigma if estimated else BASE)
         self.spread: Callable[[np.ndarray], np.ndarray] | None = None
         self._stays = base.measurement.frame == 'map' and base.measurement.drift == 0.0
         self._travel: tuple[float, float] | None = None  # [s], [m]

@@ -223,7 +223,7 @@ class Parameters:
 def _possible(robot: RobotDescription, boards: dict[str, str]):
     """Yield kind, name and sigmas of all that may be off, whether or not it is exact."""
     told = robot.tolerances
-    mount = np.repeat([told.mount_position, np.radians(told.mount_rotation_deg)], 3)
+    mount = told.mount_sigma
     for tof in robot.tof:
         yield 'mount', tof.name, mount
         yield 'range', tof.name, np.array([told.range_offset, told.range_scale])
@@ -241,7 +241,7 @@ def _possible(robot: RobotDescription, boards: dict[str, str]):
         if board != name:
             yield 'delay', name, np.array([told.delay])
     if robot.base.mode == 'fixed':
-        yield 'base', '', np.repeat([told.base_position, np.radians(told.base_rotation_deg)], 3)
+        yield 'base', '', told.base_sigma
     if robot.tof:
         yield 'map', '', np.repeat([told.map_position, np.radians(told.map_rotation_deg)], 3)
     yield 'length', '', np.array([told.length])

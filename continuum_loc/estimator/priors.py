@@ -138,9 +138,7 @@ class Priors:
         information = self._base_information[0]
         if not settings.calibration.enabled or robot.base.mode != 'fixed':
             return information
-        told = robot.tolerances
-        built = np.repeat([told.base_position, np.radians(told.base_rotation_deg)], 3)
-        return 1.0 / (1.0 / information + np.square(built))
+        return 1.0 / (1.0 / information + np.square(robot.tolerances.base_sigma))
 
     def describe(self, robot: RobotDescription) -> None:
         """Take the base and the rest strain of a robot with other constants (`parameters`)."""
@@ -247,7 +245,7 @@ def _base_of(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
     """Pose of the base in the middle of its travel, and `OfColumn.base_information`."""
     base, insertion = robot.base, robot.base.insertion
     middle = 0.0 if insertion.mode == 'fixed' else float(np.mean(insertion.range))
-    sigma = np.array([base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3)
+    sigma = base.sigma
     rate = np.array([BASE_TRANSVERSE_VELOCITY] * 3 + [BASE_ANGULAR_VELOCITY] * 3)
     if insertion.mode != 'fixed':
         sigma[0] = max(insertion.range[1] - insertion.range[0], 1e-3)
@@ -270,8 +268,7 @@ def _carried(robot: RobotDescription, grid: Grid) -> np.ndarray:
 
 def _lasting(robot: RobotDescription) -> np.ndarray:
     """Variance (6,) of the part of a base's error that lasts."""
-    base = robot.base
-    return np.repeat(np.square([base.sigma_position, np.radians(base.sigma_rotation_deg)]), 3)
+    return np.square(robot.base.sigma)
 
 
 def _loosely(spread: tuple[float, float]) -> np.ndarray:

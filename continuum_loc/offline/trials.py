@@ -17,9 +17,8 @@ from typing import Any, TYPE_CHECKING
 from continuum_loc import lie
 from continuum_loc.errors import SettingsError
 from continuum_loc.measurements import Measurement, TruthSample
-from continuum_loc.robot import load_robot, RobotDescription
+from continuum_loc.robot import based, load_robot, RobotDescription
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from continuum_loc.simulator.departures import Departures
@@ -250,11 +249,8 @@ def _true_world(
 def _base_drawn(robot: RobotDescription, seed: int) -> RobotDescription:
     """Move the robot's base by a draw from the spread that its description states."""
     base = robot.base
-    sigma = [base.sigma_position] * 3 + [np.radians(base.sigma_rotation_deg)] * 3
-    T_map_base = base.T_map_base @ lie.exp(sigma * np.random.default_rng(seed).normal(size=6))
-    rpy_deg = Rotation.from_matrix(T_map_base[:3, :3]).as_euler('xyz', degrees=True)
-    moved = {'xyz': tuple(T_map_base[:3, 3]), 'rpy_deg': tuple(rpy_deg)}
-    return robot.model_copy(update={'base': type(base)(**{**base.model_dump(), **moved})})
+    T_map_base = base.T_map_base @ lie.exp(base.sigma * np.random.default_rng(seed).normal(size=6))
+    return robot.model_copy(update={'base': based(base, T_map_base)})
 
 
 def _disturbed(
