@@ -42,6 +42,21 @@ class Model(NamedTuple):
     tip: np.ndarray
 
 
+class Reached(NamedTuple):
+    """
+    An equilibrium of N elements, from which slopes by P parameters are taken.
+
+    memory (N, 2) of the friction before it, q (N, 4) its strain, residual (4 N,) of its balance,
+    L (4 N, 4 N) its factored tangent, d_memory (P, N, 2) slopes of the memory.
+    """
+
+    memory: np.ndarray
+    q: np.ndarray
+    residual: np.ndarray
+    L: np.ndarray
+    d_memory: np.ndarray
+
+
 class History(NamedTuple):
     """
     What became of it.
@@ -123,8 +138,9 @@ def _follow(model, moved, step, balance, history):
             if not factorise(balance.tangent, 0.0, L):
                 factorise(balance.tangent, 1e-6, L)
             own[:] = balance.residual
+            reached = Reached(memory, q, own, L, d_memory)
             for i in range(parameters):
-                _slope(moved, i, t, step[i], memory, q, own, L, d_memory, dq[i], balance, history)
+                _slope(moved, i, t, step[i], reached, dq[i], balance, history)
                 for k in range(3):
                     for a in range(size):
                         history.slope[t, k, i] += history.by_strain[t, k, a] * dq[i, a]
@@ -145,7 +161,7 @@ def _by_strain(balance, tip, out):
 
 
 @kernel
-def _slope(moved, i, t, step, memory, q, own, L, d_memory, dq, balance, history):
+def _slope(moved, i, t, step, reached, dq, balance, history):
     """Slope dq of the strain by parameter i, and of the marker at the same strain."""
     rod = Rod(moved.rod.spans[i], moved.rod.stiffness[i], moved.rod.rest[i], moved.rod.friction[i])
     tendons = Tendons(
@@ -154,6 +170,7 @@ def _slope(moved, i, t, step, memory, q, own, L, d_memory, dq, balance, history)
         moved.taken[i, t],
         moved.tendons.tension[i],
     )
+    memory, q, own = reached.memory, reached.q, reached.residual
     load = Load(moved.load.force[i], moved.load.moment[i], moved.load.weight[i])
     balance.T[0] = moved.T_map_base[i]
     assemble(rod, tendons, load, memory, q, balance)
@@ -166,8 +183,8 @@ def _slope(moved, i, t, step, memory, q, own, L, d_memory, dq, balance, history)
         A, _ = _friction(rod, n, q, memory)
         for c in range(2):
             for d in range(2):
-                dq[4 * n + 2 + c] += rod.spans[n] * A[c, d] * d_memory[i, n, d]
-    solve_factored(L, dq)
+                dq[4 * n + 2 + c] += rod.spans[n] * A[c, d] * reached.d_memory[i, n, d]
+    solve_factored(reached.L, dq)
 
 
 @kernel

@@ -86,10 +86,12 @@ class Optical(NamedTuple):
     """
     What the constants of S sensors are measured by.
 
-    columns: (S, 16) places of mount, range, clock, delay and map; T_ring_sensor: (S, 4, 4);
-    along: (Z,) one over the share of a zone's range that is measured; T_map_middle: (4, 4).
+    weights: (S,) what each counts by; columns: (S, 16) places of mount, range, clock, delay and
+    map; T_ring_sensor: (S, 4, 4); along: (Z,) one over the share of a zone's range that is
+    measured; T_map_middle: (4, 4).
     """
 
+    weights: np.ndarray
     columns: np.ndarray
     T_ring_sensor: np.ndarray
     along: np.ndarray
@@ -213,9 +215,9 @@ class TofFactor(Factor):
     def bordered(self, batch, a, b, border, of):
         if self._optical is None or self._optical[0] is not of:
             self._optical = of, self._optical_of(of)
-        optical = self._optical[1]
+        optical = self._optical[1]._replace(weights=self.weights)
         planes, rules = self.surface.planes, self.rules
-        _add_border(border, a, b, batch, self.weights, planes, rules, optical, self._work)
+        _add_border(border, a, b, batch, planes, rules, optical, self._work)
 
     def _optical_of(self, of):
         kinds = [of.columns(kind, self.sensors) for kind in ('mount', 'range', 'clock', 'delay')]
@@ -223,7 +225,9 @@ class TofFactor(Factor):
         T_map_middle = np.eye(4)
         T_map_middle[:3, 3] = of.middle
         mounts = np.array([sensor.mount.T_ring_sensor for sensor in self.robot.tof])
-        return Optical(columns, mounts, 1.0 / measured_share(self.robot.tof_model), T_map_middle)
+        return Optical(
+            self.weights, columns, mounts, 1.0 / measured_share(self.robot.tof_model), T_map_middle
+        )
 
     def clock_scores(self, batch, a, b):
         scores = ClockScores.zeros(len(self.sensors), 1 + len(MOUNT), self.grid.dim)
@@ -233,7 +237,7 @@ class TofFactor(Factor):
 
 
 @kernel
-def _add_border(border, a, b, batch, weights, planes, rules, optical, work):
+def _add_border(border, a, b, batch, planes, rules, optical, work):
     """Add what each frame says of mount, range and clock of its sensor, and of the map."""
     local, M = new_normal(8), np.zeros((8, 16))
     back, Ad = np.empty((4, 4)), np.empty((6, 6))
@@ -248,7 +252,7 @@ def _add_border(border, a, b, batch, weights, planes, rules, optical, work):
         gp.evaluate(work, batch.times[f], True, 6)
         at = work[0]
         unit = Unit(optical.T_ring_sensor[s, :3, 3], optical.along)
-        weigh_ranges(at.T, frame, weights[s], planes, rules, unit, local)
+        weigh_ranges(at.T, frame, optical.weights[s], planes, rules, unit, local)
         lie_kernels.adjoint(optical.T_ring_sensor[s], Ad)
         M[:6, :6] = Ad
         M[:6, 8] = M[:6, 9] = at.v
