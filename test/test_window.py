@@ -13,12 +13,15 @@ from continuum_loc.estimator import (
 from continuum_loc.estimator import (
     filter as filter_module,
 )
-from continuum_loc.estimator.factors import Factor, FactorReport, FACTORS
+from continuum_loc.estimator.factors import Factor, FactorReport, FACTORS, Setup
+from continuum_loc.estimator.factors.gyro import GyroFactor
 from continuum_loc.estimator.interpolation import interpolated
 from continuum_loc.estimator.normal import add_rows
+from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.recovery import SHARE_SLACK, Try
 from continuum_loc.estimator.solver import track
-from continuum_loc.estimator.state import rows_in_time
+from continuum_loc.estimator.state import column_at_rest, Grid, rows_in_time
+from continuum_loc.estimator.window import Window
 from continuum_loc.measurements import ImuSample, StrainSample, TofFrame, TrackedPose, TruthSample
 from continuum_loc.robot import load_robot, RobotDescription
 from continuum_loc.settings import parse_settings
@@ -505,3 +508,22 @@ def test_cycles_split_by_late_clocks_are_whole_again_after(prior_map):
     assert all(is_whole for time, is_whole in whole if time < 0.7)
     assert not all(is_whole for time, is_whole in whole if 0.7 < time < 1.2)
     assert all(is_whole for time, is_whole in whole if time > 1.3)
+
+
+def test_what_enters_a_window_goes_where_its_lateness_says():
+    """What is 0.03 s late at 0.12 s belongs before the knot at 0.1 s, and at 0.02 s nowhere."""
+
+    class Late(GyroFactor):
+        def lateness(self, measurement):
+            return 0.03
+
+    robot = rod()
+    grid = Grid(robot, 0.16)
+    setup = Setup(robot, grid, settings())
+    window = Window(grid, Priors(robot, grid, settings()), settings())
+    window.start(column_at_rest(grid, np.eye(4), np.tile(np.eye(6)[0], (grid.nodes, 1)), 0.0))
+    late, now = Late(setup), GyroFactor(setup)
+    for time, sensor in ((0.12, 'r1_imu'), (0.02, 'r2_imu'), (0.12, 'nobody')):
+        window.enter((late, now), time, ImuSample(EPOCH, sensor, np.ones(3), np.zeros(3)))
+    assert [len(interval.rows(late)) for interval in window.intervals] == [1, 0]
+    assert [len(interval.rows(now)) for interval in window.intervals] == [1, 1]

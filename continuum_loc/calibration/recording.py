@@ -8,11 +8,9 @@ read and linearised anew whenever the robot has turned out to be another.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 
 from continuum_loc.corrections import Corrections
-from continuum_loc.errors import CalibrationError, MeasurementError
-from continuum_loc.estimator.border import Border
+from continuum_loc.errors import CalibrationError
 from continuum_loc.estimator.factors import FACTORS, Setup
 from continuum_loc.estimator.filter import SlidingWindowFilter
 from continuum_loc.estimator.parameters import Parameters
@@ -81,7 +79,7 @@ class Recording:
             measurement = corrections.applied(measurement)
             time = seconds(measurement.stamp, self._epoch)
             if first < time <= last:
-                _enter(window, factors, time, measurement)
+                window.enter(factors, time, measurement)
         window.set_columns(self.columns[: len(window.columns)])
         for k, interval in enumerate(window.intervals):
             interval.linearise(window.priors, window.columns[k], window.columns[k + 1])
@@ -90,18 +88,9 @@ class Recording:
 
     def eliminate(self, of: Parameters) -> tuple[np.ndarray, np.ndarray]:
         """Eliminate the columns: information (P, P) and gradient (P,) of the constants."""
-        window, columns, dim = self._window, self._window.columns, self._window.grid.dim
+        window = self._window
         self._offsets = window.chain.solve([one.normal for one in window.intervals], 0)
-        C = np.zeros((len(columns), dim, of.size))
-        border = Border(C[0], np.zeros((of.size, of.size)), np.zeros(of.size))
-        window.priors.bordered(border, columns[0], 1.0, of)
-        H, g = border.H, border.g
-        for k, interval in enumerate(window.intervals):
-            border = interval.bordered(window.priors, columns[k], columns[k + 1], of)
-            C[k] += border.C[:dim]
-            C[k + 1] += border.C[dim:]
-            H += border.H
-            g += border.g
+        C, H, g = window.border(of)
         self._Z = window.chain.whiten(C)
         H = H - sum(z.T @ z for z in self._Z)
         return H, g + np.einsum('kdp,kd->p', C, np.array(self._offsets))
@@ -113,10 +102,3 @@ class Recording:
         columns = self._window.columns
         self.columns = [one.retract(move) for one, move in zip(columns, moves, strict=True)]
         return float(max(np.abs(move).max() for move in moves))
-
-
-def _enter(window: Window, factors: list, time: float, measurement: Measurement) -> None:
-    for factor in factors:
-        if isinstance(measurement, factor.consumes):
-            with suppress(MeasurementError):
-                window.interval_at(time).add(factor, time, factor.row(measurement))

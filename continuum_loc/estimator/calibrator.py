@@ -153,13 +153,5 @@ class Calibrator:
 
     def _first_sensitivity(self) -> np.ndarray:
         """Sensitivity (D, P) of the newest column but one, before any column was marginalised."""
-        window, dim = self._window, self._window.grid.dim
-        C = np.zeros((len(window.columns), dim, self.parameters.size))
-        C[0] = self._begin(window.columns[0]).C
-        for k, interval in enumerate(window.intervals):
-            border = interval.bordered(
-                window.priors, window.columns[k], window.columns[k + 1], self.parameters
-            )
-            C[k] += border.C[:dim]
-            C[k + 1] += border.C[dim:]
-        return window.chain.unwhiten(window.chain.whiten(C))[-2]
+        chain = self._window.chain
+        return chain.unwhiten(chain.whiten(self._window.border(self.parameters).C))[-2]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from continuum_loc.errors import MeasurementError, SingularError
+from continuum_loc.errors import SingularError
 from continuum_loc.estimator.factors import FACTORS, Setup
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.solver import from_a_guess
@@ -106,7 +106,7 @@ class Stretch:
         for measurement in self._measurements:
             changed = explanation.change(measurement)
             if changed is not None:
-                self._enter(window, factors, changed)
+                window.enter(factors, seconds(changed.stamp, self._epoch), changed)
         if not window.intervals:
             return None
         window.set_columns(columns[: len(window.columns)])
@@ -119,18 +119,6 @@ class Stretch:
             for factor, report in interval.reports.items():
                 costs[factor.name] = costs.get(factor.name, 0.0) + report.cost
         return Outcome(costs, window)
-
-    def _enter(self, window: Window, factors: list, measurement: Measurement) -> None:
-        time = seconds(measurement.stamp, self._epoch)
-        for factor in factors:
-            if isinstance(measurement, factor.consumes):
-                try:
-                    row = factor.row(measurement)
-                except MeasurementError:
-                    continue
-                time -= factor.lateness(measurement)
-                if time > window.columns[0].time:
-                    window.interval_at(time).add(factor, time, row)
 
 
 def base_freed(robot: RobotDescription) -> RobotDescription:

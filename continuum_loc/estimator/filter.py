@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
 import time as clock
@@ -331,15 +330,9 @@ class SlidingWindowFilter:
         for one in self._raw:
             one = self._corrections.applied(one)
             at = seconds(one.stamp, self.epoch)
-            if oldest <= at <= self.window.columns[-1].time + TIME_EPSILON:
-                self._enter_again(at, one)
+            if at <= self.window.columns[-1].time + TIME_EPSILON:
+                self.window.enter(self.factors, at, one)
         self._raw.append(measurement)
-
-    def _enter_again(self, time: float, measurement: Measurement) -> None:
-        """Put a measurement that was counted before into its interval."""
-        for factor in self._consumers(type(measurement)):
-            with suppress(MeasurementError):
-                self.window.interval_at(time).add(factor, time, factor.row(measurement))
 
     def _guess(self) -> None:
         """Start from what the first samples tell of base and shape; straight without them."""

@@ -9,12 +9,16 @@ the window moves on; the point at which that happened is pinned (first-estimate 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from math import ceil
 
 from continuum_loc import lie
+from continuum_loc.errors import MeasurementError
+from continuum_loc.estimator.border import Border
 from continuum_loc.estimator.chain import Chain
+from continuum_loc.estimator.factors import Factor
 from continuum_loc.estimator.interpolation import (
     Body,
     body_between,
@@ -23,9 +27,11 @@ from continuum_loc.estimator.interpolation import (
 )
 from continuum_loc.estimator.interval import Interval
 from continuum_loc.estimator.normal import Normal
+from continuum_loc.estimator.parameters import Parameters
 from continuum_loc.estimator.priors import Priors
 from continuum_loc.estimator.settings import EstimatorSettings
 from continuum_loc.estimator.state import Column, Grid, TIME_EPSILON
+from continuum_loc.measurements import Measurement
 import numpy as np
 
 # Told of an interval, its columns and the chain before the older column is marginalised.
@@ -80,6 +86,38 @@ class Window:
             self._append()
         k = ceil((time - self.columns[0].time) / self.settings.knot_period - 1e-6) - 1
         return self.intervals[min(max(k, 0), len(self.intervals) - 1)]
+
+    def enter(self, factors: Iterable[Factor], time: float, measurement: Measurement) -> None:
+        """
+        Put a measurement of `time` [s] into its interval, for those of `factors` that it is for.
+
+        Nothing is counted: what cannot be used, or comes from before the window, is left out.
+        """
+        for factor in factors:
+            if isinstance(measurement, factor.consumes):
+                with suppress(MeasurementError):
+                    row = factor.row(measurement)
+                    at = time - factor.lateness(measurement)
+                    if at > self.columns[0].time:
+                        self.interval_at(at).add(factor, at, row)
+
+    def border(self, of: Parameters) -> Border:
+        """
+        Say what the window, as linearised, tells of the constants `of` the robot.
+
+        C is (K, D, P) here: that of each of K columns.
+        """
+        dim, size = self.grid.dim, of.size
+        C = np.zeros((len(self.columns), dim, size))
+        total = Border(C, np.zeros((size, size)), np.zeros(size))
+        self.priors.bordered(total._replace(C=C[0]), self.columns[0], 1.0, of)
+        for k, interval in enumerate(self.intervals):
+            one = interval.bordered(self.priors, self.columns[k], self.columns[k + 1], of)
+            C[k] += one.C[:dim]
+            C[k + 1] += one.C[dim:]
+            total.H[:] += one.H
+            total.g[:] += one.g
+        return total
 
     def _append(self) -> None:
         newest = self.column(-1)
